@@ -1,0 +1,161 @@
+"""What was observed: a fixed-capacity, masked table of transitions."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from boomdp_jax.core.arrays import IntScalar
+
+
+class Transition(eqx.Module):
+    """One observed step (s, a, s') of every body.
+
+    A state holds x, y, theta, xdot, ydot, thetadot of a body's centre of mass [m,
+    rad, m/s, rad/s]; the action is the wrench (f_x, f_y, tau) at the centre of mass
+    [N, N, N m], held over `dt` [s].
+    """
+
+    state: Float[Array, "*batch body 6"]
+    action: Float[Array, "*batch body 3"]
+    next_state: Float[Array, "*batch body 6"]
+    dt: Float[Array, "*batch"]
+
+
+class History(eqx.Module):
+    """A table of transitions with a mask, so that a longer history never recompiles.
+
+    Missing readings are masked channel by channel and hold zero. `is_chained[t]` says
+    that the reading `state[t]` is the very reading `next_state[t - 1]`.
+    """
+
+    state: Float[Array, "*batch time body 6"]
+    action: Float[Array, "*batch time body 3"]
+    next_state: Float[Array, "*batch time body 6"]
+    dt: Float[Array, "*batch time"]
+    episode: Int[Array, "*batch time"]
+    mask: Bool[Array, "*batch time"]
+    state_mask: Bool[Array, "*batch time body 6"]
+    next_state_mask: Bool[Array, "*batch time body 6"]
+    is_chained: Bool[Array, "*batch time"]
+
+    @property
+    def num_transitions(self) -> IntScalar:
+        """How many rows are in use."""
+        return jnp.sum(self.mask, axis=-1)
+
+    @property
+    def capacity(self) -> int:
+        """How many rows there is room for."""
+        return self.mask.shape[-1]
+
+    @property
+    def num_bodies(self) -> int:
+        """How many bodies a row describes."""
+        return self.state.shape[-2]
+
+    @property
+    def transitions(self) -> Transition:
+        """All rows, masked ones included."""
+        return Transition(self.state, self.action, self.next_state, self.dt)
+
+
+def make_history(
+    state: np.ndarray | Array,
+    action: np.ndarray | Array,
+    next_state: np.ndarray | Array,
+    dt: np.ndarray | Array | float,
+    *,
+    episode: np.ndarray | None = None,
+    point: np.ndarray | None = None,
+    capacity: int | None = None,
+) -> History:
+    """Check a table of transitions and pad it to a capacity.
+
+    Args:
+        state: readings before each step, `[time, body, 6]`; NaN marks a missing one.
+        action: wrenches at the centre of mass, `[time, body, 3]` [N, N, N m].
+        next_state: readings after each step, like `state`.
+        dt: length of a step [s], one for all or one per row.
+        episode: which run a row belongs to, `[time]`; default: one run.
+        point: world point at which the force acts, `[time, body, 2]` [m], instead of
+            the centre of mass.
+        capacity: rows to make room for; default: as many as there are.
+
+    Returns:
+        The history, on the default float type.
+
+    Raises:
+        ValueError: a wrong shape, an action that is not finite, a step length that is
+            not positive, an infinite reading, or more rows than the capacity.
+    """
+    state, action = np.asarray(state, float), np.asarray(action, float)
+    next_state = np.asarray(next_state, float)
+    if state.ndim != 3 or state.shape[-1] != 6:
+        raise ValueError(f"state: expected shape [time, body, 6], got {state.shape}")
+    num_rows, num_bodies = state.shape[:2]
+    capacity = num_rows if capacity is None else capacity
+    if capacity < num_rows:
+        raise ValueError(f"capacity: expected at least {num_rows} rows, got {capacity}")
+    episode = np.zeros(num_rows, int) if episode is None else np.asarray(episode)
+    dt = np.broadcast_to(np.asarray(dt, float), (num_rows,))
+    expected = {
+        "action": (action, (num_rows, num_bodies, 3)),
+        "next_state": (next_state, (num_rows, num_bodies, 6)),
+        "episode": (episode, (num_rows,)),
+    }
+    if point is not None:
+        point = np.asarray(point, float)
+        expected["point"] = (point, (num_rows, num_bodies, 2))
+    for name, (array, shape) in expected.items():
+        if array.shape != shape:
+            raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
+    if not np.all(np.isfinite(dt)) or not np.all(dt > 0):
+        raise ValueError(f"dt: expected positive seconds, got {np.min(dt)}")
+    if not np.all(np.isfinite(action)):
+        row, body, _ = np.argwhere(~np.isfinite(action))[0]
+        raise ValueError(
+            f"action: expected finite wrenches, got {action[row, body]} in row {row}, "
+            f"body {body}"
+        )
+    for name, array in (("state", state), ("next_state", next_state)):
+        if np.any(np.isinf(array)):
+            row, body, _ = np.argwhere(np.isinf(array))[0]
+            raise ValueError(
+                f"{name}: expected finite readings or NaN for a missing one, got "
+                f"{array[row, body]} in row {row}, body {body}"
+            )
+    if point is not None:
+        action = _move_to_centre(action, point, state)
+    is_chained = np.zeros(num_rows, bool)
+    if num_rows > 1:
+        now, before = state[1:], next_state[:-1]
+        same = np.all((now == before) | (np.isnan(now) & np.isnan(before)), axis=(1, 2))
+        is_chained[1:] = same & (episode[1:] == episode[:-1])
+
+    def pad(array, fill=0):
+        width = [(0, capacity - num_rows)] + [(0, 0)] * (array.ndim - 1)
+        return np.pad(array, width, constant_values=fill)
+
+    return History(
+        state=jnp.asarray(pad(np.nan_to_num(state)), float),
+        action=jnp.asarray(pad(action), float),
+        next_state=jnp.asarray(pad(np.nan_to_num(next_state)), float),
+        dt=jnp.asarray(pad(dt, dt[0] if num_rows else 1.0), float),
+        episode=jnp.asarray(pad(episode.astype(np.int32), -1)),
+        mask=jnp.asarray(pad(np.ones(num_rows, bool))),
+        state_mask=jnp.asarray(pad(~np.isnan(state))),
+        next_state_mask=jnp.asarray(pad(~np.isnan(next_state))),
+        is_chained=jnp.asarray(pad(is_chained)),
+    )
+
+
+def _move_to_centre(
+    action: np.ndarray, point: np.ndarray, state: np.ndarray
+) -> np.ndarray:
+    """Turn a force at a world point into a wrench at the centre of mass."""
+    arm = np.where(np.isfinite(point), point - state[..., :2], 0.0)
+    torque = arm[..., 0] * action[..., 1] - arm[..., 1] * action[..., 0]
+    return np.concatenate(
+        [action[..., :2], action[..., 2:] + np.nan_to_num(torque)[..., None]], axis=-1
+    )

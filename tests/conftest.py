@@ -1,0 +1,29 @@
+"""Set-up of every test: 64 bit, ranks that never broadcast silently, checked shapes."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import jax
+import pytest
+from jaxtyping import install_import_hook
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+install_import_hook("boomdp_jax", "beartype.beartype")
+
+
+class Precision(NamedTuple):
+    """The float type that a test runs in."""
+
+    bits: int
+
+    def choose(self, *, single: float, double: float) -> float:
+        """Pick the tolerance that belongs to this float type."""
+        return single if self.bits == 32 else double
+
+
+@pytest.fixture(params=[32, 64], ids=["float32", "float64"])
+def precision(request: pytest.FixtureRequest) -> Iterator[Precision]:
+    """Run the test once on 32 bit floats and once on 64 bit ones."""
+    with jax.enable_x64(request.param == 64):
+        yield Precision(request.param)
