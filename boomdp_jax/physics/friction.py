@@ -1,0 +1,302 @@
+r"""The one friction law, and where wheels, floors and joints apply it.
+
+A contact moves with velocity $u = T w$, where $w$ is the twist of its body in the body
+frame and the rows of $T$ are its rolling and its lateral direction. The force on the
+body along these directions is
+
+$$f(u) = -C u \min(1, 1/s), \qquad s = |D^{-1} C u|,$$
+
+with $C$ the viscous coefficients and $D$ the dry limits, both diagonal: viscous, and
+scaled back along its own direction onto the ellipse of dry limits where it lies
+outside. Its derivative is $-K$ with $K = C$ inside the ellipse and
+$K = (C - C u\,(D^{-2}C^2 u)^T / s^2)/s$ outside. A joint's friction is the same law in
+one dimension.
+
+Everything here is constant in the body frame, so it is prepared once per rollout.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from boomdp_jax.physics.params import Ground, Params, Wheel
+from boomdp_jax.physics.scene import Scene
+from boomdp_jax.physics.small_linear import dot3, matvec3
+from boomdp_jax.physics.trigonometry import sincos
+
+PerContact = Float[Array, "*contact"]
+
+
+class Contact(NamedTuple):
+    """Points where friction acts, in two directions; fields `[contact, *body]`."""
+
+    rolling: tuple[PerContact, PerContact, PerContact]
+    """Row of T: velocity along the heading per twist in the body frame."""
+    lateral: tuple[PerContact, PerContact, PerContact]
+    viscous: tuple[PerContact, PerContact]
+    """C: force per speed, rolling and lateral [N s/m]."""
+    knee: tuple[PerContact, PerContact]
+    """C over D: one over the speed at which the limit is reached [s/m]."""
+    weight: tuple[PerContact, PerContact]
+    """Share of the end velocity in the velocity that friction sees."""
+
+
+class Spin(NamedTuple):
+    """Friction against spin; fields `[spin, *body]`."""
+
+    viscous: PerContact
+    knee: PerContact
+    weight: PerContact
+
+
+def _over(numerator, denominator):
+    """A ratio that is zero where the denominator is infinite or not positive."""
+    is_limited = (denominator > 0) & jnp.isfinite(denominator)
+    return jnp.where(is_limited, numerator / jnp.where(is_limited, denominator, 1), 0.0)
+
+
+class _Points(NamedTuple):
+    """Contacts as authored: place, heading, coefficients; fields `[contact, body]`."""
+
+    x: PerContact
+    y: PerContact
+    heading: PerContact
+    viscous: tuple[PerContact, PerContact]
+    dry: tuple[PerContact, PerContact]
+    active: Bool[Array, "*contact"]
+
+
+def _wheel_points(wheel: Wheel) -> _Points:
+    """One contact, or two with half the coefficients where there is a track."""
+    points = _Points(
+        x=wheel.position[..., 0].T,
+        y=wheel.position[..., 1].T,
+        heading=wheel.heading.T,
+        viscous=(wheel.viscous[..., 0].T, wheel.viscous[..., 1].T),
+        dry=(wheel.dry[..., 0].T, wheel.dry[..., 1].T),
+        active=wheel.active.T,
+    )
+    if wheel.half_track is None:
+        return points
+    sin, cos = sincos(points.heading)
+    dx, dy = -sin * wheel.half_track.T, cos * wheel.half_track.T
+
+    def side(sign: float) -> _Points:
+        return points._replace(
+            x=points.x + sign * dx,
+            y=points.y + sign * dy,
+            viscous=(0.5 * points.viscous[0], 0.5 * points.viscous[1]),
+            dry=(0.5 * points.dry[0], 0.5 * points.dry[1]),
+        )
+
+    return _join(side(-1.0), side(1.0))
+
+
+def _join(*parts: _Points) -> _Points:
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+
+
+def _foot_points(
+    scene: Scene, ground: Ground, mass: Float[Array, " body"]
+) -> tuple[_Points, Spin]:
+    """Feet that share load and viscosity, and what of their torque is decoupled."""
+    load = mass * scene.normal_gravity
+    viscous, active = ground.viscous.T, ground.active.T
+    is_dry = jnp.isfinite(ground.dry.T)
+    limit = jnp.where(is_dry, ground.dry.T, 0.0) * load[None]
+    limit = jnp.where(is_dry, limit, jnp.inf)
+    num, num_feet = active.shape[0], scene.feet.shape[-2]
+    share = jnp.zeros_like(viscous)
+    shift = (jnp.zeros_like(viscous), jnp.zeros_like(viscous))
+    if ground.torque_share is not None:
+        share = ground.torque_share.T
+    if ground.load_shift is not None:
+        shift = (ground.load_shift[..., 0].T, ground.load_shift[..., 1].T)
+
+    def each(value: Array) -> Array:
+        """Of a slot, for each of its feet: `[slot * foot, body]`."""
+        return jnp.repeat(value, num_feet, axis=0)
+
+    def tile(value: Array) -> Array:
+        """Of a foot, for each slot."""
+        return jnp.tile(value.T, (num, 1))
+
+    part = tile(scene.foot_load)
+    c, d = each(viscous) * part, each(limit) * part
+    points = _Points(
+        x=(1.0 - each(share)) * tile(scene.feet[..., 0]) + each(shift[0]),
+        y=(1.0 - each(share)) * tile(scene.feet[..., 1]) + each(shift[1]),
+        heading=jnp.zeros_like(c),
+        viscous=(c, c),
+        dry=(d, d),
+        active=each(active),
+    )
+    square = jnp.sum(scene.foot_load * jnp.sum(scene.feet**2, axis=-1), axis=-1)
+    arm = jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    arm = share * jnp.where(square > 0, arm, 0.0)[None]
+    has_arm = arm > 0
+    dry = jnp.where(has_arm, limit * jnp.where(has_arm, arm, 1.0), 0.0)
+    return points, joint_spin(viscous * arm**2, dry, active)
+
+
+def friction_points(
+    scene: Scene, params: Params, mass: Float[Array, " body"]
+) -> tuple[Contact | None, Spin | None]:
+    """Every point where friction acts, and every friction against spin.
+
+    Args:
+        scene: where the feet stand.
+        params: wheels and ground friction.
+        mass: mass of every body [kg].
+
+    Returns:
+        Contacts and spins `[contact, body]`, without the implicit weights (all one);
+        None where there are none.
+    """
+    parts, spins = [], None
+    if params.wheel.active.shape[-1]:
+        parts.append(_wheel_points(params.wheel))
+    if params.ground.active.shape[-1]:
+        feet, torque = _foot_points(scene, params.ground, mass)
+        parts.append(feet)
+        spins = None if params.ground.torque_share is None else torque
+    if not parts:
+        return None, spins
+    points = _join(*parts)
+    sin, cos = sincos(points.heading)
+    # A limit of zero means no friction in that direction.
+    c = tuple(
+        jnp.where(points.active & (limit > 0), coefficient, 0.0)
+        for coefficient, limit in zip(points.viscous, points.dry, strict=True)
+    )
+    knee = tuple(_over(v, limit) for v, limit in zip(c, points.dry, strict=True))
+    one = jnp.ones_like(points.x)
+    contact = Contact(
+        rolling=(cos, sin, points.x * sin - points.y * cos),
+        lateral=(-sin, cos, points.x * cos + points.y * sin),
+        viscous=(c[0], c[1]),
+        knee=(knee[0], knee[1]),
+        weight=(one, one),
+    )
+    return contact, spins
+
+
+def joint_spin(viscous: Array, dry: Array, active: Array) -> Spin:
+    """Friction of a joint against relative spin [N m s/rad], limit [N m]."""
+    c = jnp.where(active & (dry > 0), viscous, 0.0)
+    return Spin(viscous=c, knee=_over(c, dry), weight=jnp.ones_like(c))
+
+
+def implicit_weight(decay: Float[Array, "..."]) -> Float[Array, "..."]:
+    r"""Share of the end velocity that makes a step exact for linear decay.
+
+    With $z$ the decay over a step (rate times length), a step that applies friction at
+    $\vartheta u' + (1-\vartheta) u$ multiplies a velocity by
+    $(1-(1-\vartheta)z)/(1+\vartheta z)$. For $\vartheta = 1/(1-e^{-z}) - 1/z$ this
+    is $e^{-z}$, and the response to a constant force is exact too. It tends to 1/2
+    (second order) where friction is slow and to 1 (backward Euler, no overshoot) where
+    it is stiff. Exponential fitting: Liniger and Willoughby (1970), SIAM J. Numer.
+    Anal. 7, 47.
+    """
+    is_small = decay < 0.05
+    z = jnp.where(is_small, 1.0, decay)
+    exact = -1.0 / jnp.expm1(-z) - 1.0 / z
+    return jnp.where(is_small, 0.5 + decay / 12.0, exact)
+
+
+def fit_weights(
+    contacts: Contact | None, spins: Spin | None, inverse, mass, inertia, mobile, length
+) -> tuple[Contact | None, Spin | None]:
+    """Turn forces into impulses, bound their stiffness, and fit the blend weights.
+
+    In single precision a stiffness beyond `bound` times the inertia would drown the
+    inertia in rounding, so it is held there: what is left of the velocity after a step
+    is then one part in `bound`.
+
+    Args:
+        contacts: from `friction_points`.
+        spins: likewise.
+        inverse: twist per impulse in the body frame, 3 x 3 entries per body.
+        mass: of each body [kg].
+        inertia: of each body [kg m²].
+        mobile: one for bodies that move, zero for static ones.
+        length: of the step [s].
+
+    Returns:
+        Both, coefficients times the length of the step.
+    """
+    bound = 1e-4 / jnp.finfo(mass.dtype).eps
+    zero = jnp.zeros_like(mass)
+    damping = [[zero] * 3 for _ in range(3)]
+
+    def bounded(viscous, knee, ease):
+        new = mobile[None] * jnp.minimum(length * viscous, bound / ease)
+        whole = jnp.where(viscous > 0, length * viscous, 1.0)
+        return new, knee * new / whole
+
+    def plain_ease(row):
+        return (row[0] ** 2 + row[1] ** 2) / mass[None] + row[2] ** 2 / inertia[None]
+
+    if contacts is not None:
+        rows = (contacts.rolling, contacts.lateral)
+        pairs = [
+            bounded(c, g, plain_ease(row))
+            for c, g, row in zip(contacts.viscous, contacts.knee, rows, strict=True)
+        ]
+        contacts = contacts._replace(
+            viscous=tuple(p[0] for p in pairs), knee=tuple(p[1] for p in pairs)
+        )
+        for row, v in zip(rows, contacts.viscous, strict=True):
+            damping = [
+                [damping[i][j] + jnp.sum(v * row[i] * row[j], axis=0) for j in range(3)]
+                for i in range(3)
+            ]
+    if spins is not None:
+        viscous, knee = bounded(spins.viscous, spins.knee, 1.0 / inertia[None])
+        spins = spins._replace(viscous=viscous, knee=knee)
+        damping[2][2] = damping[2][2] + jnp.sum(viscous, axis=0)
+    inverse = [[entry[None] for entry in row] for row in inverse]
+    damping = [[entry[None] for entry in row] for row in damping]
+
+    def weight(row):
+        push = matvec3(inverse, row)
+        ease = dot3(row, push)
+        is_free = ease > 1e-6 * plain_ease(row)
+        decay = dot3(push, matvec3(damping, push)) / jnp.where(is_free, ease, 1.0)
+        return implicit_weight(jnp.where(is_free, decay, 0.0))
+
+    if contacts is not None:
+        contacts = contacts._replace(weight=tuple(weight(row) for row in rows))
+    if spins is not None:
+        none = jnp.zeros_like(spins.viscous)
+        spins = spins._replace(weight=weight((none, none, none + 1.0)))
+    return contacts, spins
+
+
+def limited(u: tuple, viscous: tuple, knee: tuple):
+    """Scale of the viscous force, and the derivative K of the force.
+
+    Args:
+        u: contact velocity, one or two components [m/s].
+        viscous: C, as many.
+        knee: C over D, as many.
+
+    Returns:
+        The scale min(1, 1/s), and K as rows of entries.
+    """
+    ratio = [g * x for g, x in zip(knee, u, strict=True)]
+    square = sum(r * r for r in ratio)
+    is_slip = square > 1.0
+    scale = jnp.where(is_slip, 1.0 / jnp.sqrt(jnp.where(is_slip, square, 1.0)), 1.0)
+    inverse_square = jnp.where(is_slip, scale * scale, 0.0)
+    rows = []
+    for i in range(len(u)):
+        pull = scale * viscous[i]
+        row = [
+            -pull * u[i] * knee[j] * ratio[j] * inverse_square for j in range(len(u))
+        ]
+        row[i] = row[i] + pull
+        rows.append(tuple(row))
+    return scale, tuple(rows)

@@ -1,0 +1,133 @@
+"""Φ: every latent physical number of one hypothesis, in fixed slots with masks."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+WORLD = -1
+"""Index that stands for the world as a joint's partner."""
+
+
+class Revolute(eqx.Module):
+    """Pins: an anchor of body `a` and one of body `b` (or a world point) coincide."""
+
+    active: Bool[Array, "*batch joint"]
+    body_a: Int[Array, "*batch joint"]
+    body_b: Int[Array, "*batch joint"]
+    """Partner; `WORLD` for the world."""
+    anchor_a: Float[Array, "*batch joint 2"]
+    """In the frame of body `a` [m]."""
+    anchor_b: Float[Array, "*batch joint 2"]
+    """In the frame of body `b`, or of the world [m]."""
+    viscous: Float[Array, "*batch joint"]
+    """Joint friction torque per relative spin [N m s/rad]."""
+    dry: Float[Array, "*batch joint"]
+    """Largest joint friction torque [N m]; infinite for purely viscous friction."""
+
+
+class Distance(eqx.Module):
+    """Rods: an anchor of `a` stays `length` away from one of `b` or of the world."""
+
+    active: Bool[Array, "*batch joint"]
+    body_a: Int[Array, "*batch joint"]
+    body_b: Int[Array, "*batch joint"]
+    anchor_a: Float[Array, "*batch joint 2"]
+    anchor_b: Float[Array, "*batch joint 2"]
+    length: Float[Array, "*batch joint"]
+    """Rest length [m]."""
+
+
+class Wheel(eqx.Module):
+    """Anisotropic friction at a pose in the body frame, one row of slots per body."""
+
+    active: Bool[Array, "*batch body wheel"]
+    position: Float[Array, "*batch body wheel 2"]
+    """Where the wheel touches the floor, body frame [m]."""
+    heading: Float[Array, "*batch body wheel"]
+    """Direction of rolling in the body frame [rad]."""
+    viscous: Float[Array, "*batch body wheel 2"]
+    """Force per speed, rolling and lateral [N s/m]."""
+    dry: Float[Array, "*batch body wheel 2"]
+    """Largest force, rolling and lateral [N]; infinite for a purely viscous wheel."""
+    half_track: Float[Array, "*batch body wheel"] | None = None
+    """Half the distance of two equal wheels on the axle [m]; None: one contact."""
+
+
+class Ground(eqx.Module):
+    """Isotropic friction between a body's feet and the floor."""
+
+    active: Bool[Array, "*batch body ground"]
+    dry: Float[Array, "*batch body ground"]
+    """Friction coefficient; infinite for purely viscous friction."""
+    viscous: Float[Array, "*batch body ground"]
+    """Force per speed, all feet together [N s/m]."""
+    torque_share: Float[Array, "*batch body ground"] | None = None
+    """Share of the friction torque that does not depend on sliding, in [0, 1]."""
+    load_shift: Float[Array, "*batch body ground 2"] | None = None
+    """Offset of the centre of load from the feet's own, body frame [m]."""
+
+
+class Params(eqx.Module):
+    """One hypothesis Φ. Structure is which slots are active; shapes never change."""
+
+    density: Float[Array, "*batch body"]
+    """Mass per area [kg/m²]."""
+    revolute: Revolute
+    distance: Distance
+    wheel: Wheel
+    ground: Ground
+
+
+def empty_params(
+    num_bodies: int,
+    *,
+    num_revolute: int = 0,
+    num_distance: int = 0,
+    num_wheel: int = 0,
+    num_ground: int = 0,
+    density: float = 1.0,
+) -> Params:
+    """Params with every slot inactive and holding zeros.
+
+    Args:
+        num_bodies: bodies in the scene.
+        num_revolute: revolute slots of the whole scene.
+        num_distance: distance slots of the whole scene.
+        num_wheel: wheel slots of each body.
+        num_ground: ground slots of each body.
+        density: density of every body [kg/m²].
+
+    Returns:
+        The params, unbatched, without law-shape nuisances.
+    """
+
+    def joint_slots(num: int) -> dict:
+        return {
+            "active": jnp.zeros(num, bool),
+            "body_a": jnp.zeros(num, jnp.int32),
+            "body_b": jnp.full(num, WORLD, jnp.int32),
+            "anchor_a": jnp.zeros((num, 2)),
+            "anchor_b": jnp.zeros((num, 2)),
+        }
+
+    return Params(
+        density=jnp.full(num_bodies, density, float),
+        revolute=Revolute(
+            **joint_slots(num_revolute),
+            viscous=jnp.zeros(num_revolute),
+            dry=jnp.zeros(num_revolute),
+        ),
+        distance=Distance(**joint_slots(num_distance), length=jnp.zeros(num_distance)),
+        wheel=Wheel(
+            active=jnp.zeros((num_bodies, num_wheel), bool),
+            position=jnp.zeros((num_bodies, num_wheel, 2)),
+            heading=jnp.zeros((num_bodies, num_wheel)),
+            viscous=jnp.zeros((num_bodies, num_wheel, 2)),
+            dry=jnp.zeros((num_bodies, num_wheel, 2)),
+        ),
+        ground=Ground(
+            active=jnp.zeros((num_bodies, num_ground), bool),
+            dry=jnp.zeros((num_bodies, num_ground)),
+            viscous=jnp.zeros((num_bodies, num_ground)),
+        ),
+    )

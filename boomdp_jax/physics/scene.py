@@ -1,0 +1,40 @@
+"""What is seen of a scene: outlines, supports, gravity and time step, as arrays."""
+
+import equinox as eqx
+from jaxtyping import Array, Bool, Float
+
+
+class Scene(eqx.Module):
+    """The observed part of a world, arrays only, so that scenes stack and vmap.
+
+    Every body's outline is in the frame whose origin is its centre of mass. A circle
+    has a `radius` and no vertices; a polygon has a radius of zero.
+    """
+
+    vertices: Float[Array, "*batch body vertex 2"]
+    """Corners, counter-clockwise [m]; unused ones repeat the last."""
+    vertex_mask: Bool[Array, "*batch body vertex"]
+    radius: Float[Array, "*batch body"]
+    """Radius of a circle [m], zero for a polygon."""
+    area: Float[Array, "*batch body"]
+    """Area of the outline [m²]."""
+    gyration: Float[Array, "*batch body"]
+    """Squared radius of gyration about the centre of mass, inertia over mass [m²]."""
+    feet: Float[Array, "*batch body foot 2"]
+    """Where the body stands on the floor, body frame [m]."""
+    foot_load: Float[Array, "*batch body foot"]
+    """Share of the weight on each foot; sums to one over a body's feet."""
+    is_static: Bool[Array, "*batch body"]
+    gravity: Float[Array, "*batch 2"]
+    """In-plane gravity [m/s²]."""
+    normal_gravity: Float[Array, "*batch"]
+    """Gravity across the plane, the load on floor and wheels [m/s²]."""
+    dt: Float[Array, "*batch"]
+    """Default length of a step [s]."""
+    num_substeps: int = eqx.field(static=True, default=2)
+    """Equal parts into which a step is cut."""
+
+    @property
+    def num_bodies(self) -> int:
+        """How many bodies there is room for."""
+        return self.area.shape[-1]

@@ -1,0 +1,183 @@
+"""From what a file says to what the engine takes: `Scene`, `State` and `Params`."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from boomdp_jax.physics.body_spec import BodySpec
+from boomdp_jax.physics.constraint_spec import ConstraintSpec, missing_numbers
+from boomdp_jax.physics.params import (
+    Distance,
+    Ground,
+    Params,
+    Revolute,
+    Wheel,
+)
+from boomdp_jax.physics.scene import Scene
+
+MIN_VERTICES = 4
+"""Least room for corners, so that scenes of boxes, triangles and circles stack."""
+
+MIN_FEET = 4
+"""Least room for feet, likewise."""
+
+
+def build_scene(
+    bodies: Sequence[BodySpec],
+    gravity: np.ndarray,
+    normal_gravity: float,
+    dt: float,
+    *,
+    num_vertices: int = MIN_VERTICES,
+    num_feet: int = MIN_FEET,
+) -> Scene:
+    """Lay out the bodies of a scene as arrays.
+
+    Args:
+        bodies: bodies in the order of the file.
+        gravity: in-plane gravity [m/s²].
+        normal_gravity: gravity across the plane [m/s²].
+        dt: default length of a step [s].
+        num_vertices: least room for corners of each body.
+        num_feet: least room for feet of each body.
+
+    Returns:
+        The scene, on the default float type.
+    """
+    num_vertices = max(num_vertices, *(len(body.outline) for body in bodies))
+    num_feet = max(num_feet, *(len(body.feet) for body in bodies))
+    vertex_mask = [np.arange(num_vertices) < len(body.outline) for body in bodies]
+    vertices = [_pad_with_last(body.vertices, num_vertices) for body in bodies]
+    feet = [_pad_with_last(body.feet, num_feet) for body in bodies]
+    loads = [np.pad(body.foot_load, (0, num_feet - len(body.feet))) for body in bodies]
+    # Concrete arrays even under a trace: the caller keeps them.
+    with jax.ensure_compile_time_eval():
+        return Scene(
+            vertices=jnp.asarray(np.stack(vertices), float),
+            vertex_mask=jnp.asarray(np.stack(vertex_mask)),
+            radius=jnp.asarray([body.radius for body in bodies], float),
+            area=jnp.asarray([body.area for body in bodies], float),
+            gyration=jnp.asarray([body.gyration for body in bodies], float),
+            feet=jnp.asarray(np.stack(feet), float),
+            foot_load=jnp.asarray(np.stack(loads), float),
+            is_static=jnp.asarray([body.is_static for body in bodies], bool),
+            gravity=jnp.asarray(gravity, float),
+            normal_gravity=jnp.asarray(normal_gravity, float),
+            dt=jnp.asarray(dt, float),
+        )
+
+
+def build_params(
+    bodies: Sequence[BodySpec], constraints: Sequence[ConstraintSpec], source: str
+) -> Params:
+    """Lay out known numbers as a hypothesis, one active slot for each constraint.
+
+    A static body without a density gets 1 kg/m²; nothing depends on it.
+
+    Args:
+        bodies: bodies in the order of the file.
+        constraints: constraints in the order of the file.
+        source: name of the file, for messages.
+
+    Returns:
+        The params, on the default float type, unbatched.
+
+    Raises:
+        ValueError: something is to be inferred; which body or constraint, which field.
+    """
+    for body in bodies:
+        if body.is_center_unknown:
+            _refuse_unknown(source, f"body {body.name!r}", "center_of_mass")
+        if body.density is None and not body.is_static:
+            _refuse_unknown(source, f"body {body.name!r}", "density")
+    for constraint in constraints:
+        for field in missing_numbers(constraint):
+            owner = f"{constraint.kind} of body {bodies[constraint.body_a].name!r}"
+            _refuse_unknown(source, owner, field)
+    joints = {
+        kind: [c for c in constraints if c.kind == kind]
+        for kind in ("revolute", "distance")
+    }
+    density = [1.0 if body.density is None else body.density for body in bodies]
+    return Params(
+        density=jnp.asarray(density, float),
+        revolute=Revolute(
+            **_joint_slots(joints["revolute"]),
+            viscous=_stack(joints["revolute"], "viscous"),
+            dry=_stack(joints["revolute"], "dry"),
+        ),
+        distance=Distance(
+            **_joint_slots(joints["distance"]),
+            length=_stack(joints["distance"], "length"),
+        ),
+        wheel=Wheel(
+            **_body_slots(
+                constraints,
+                "wheel",
+                len(bodies),
+                {"position": (2,), "heading": (), "viscous": (2,), "dry": (2,)},
+            )
+        ),
+        ground=Ground(
+            **_body_slots(
+                constraints, "ground", len(bodies), {"dry": (), "viscous": ()}
+            )
+        ),
+    )
+
+
+def _pad_with_last(points: np.ndarray, num: int) -> np.ndarray:
+    """Repeat the last point up to a capacity; zeros where there is none."""
+    if not len(points):
+        return np.zeros((num, 2))
+    return np.pad(points, ((0, num - len(points)), (0, 0)), mode="edge")
+
+
+def _refuse_unknown(source: str, owner: str, field: str) -> None:
+    raise ValueError(f"{source}: {owner}: {field}: expected a number, got unknown")
+
+
+def _stack(
+    constraints: Sequence[ConstraintSpec], key: str, shape: tuple[int, ...] = ()
+) -> jax.Array:
+    rows = [constraint.numbers[key] for constraint in constraints]
+    return jnp.asarray(np.reshape(rows, (len(rows), *shape)), float)
+
+
+def _joint_slots(joints: Sequence[ConstraintSpec]) -> dict[str, jax.Array]:
+    return {
+        "active": jnp.ones(len(joints), bool),
+        "body_a": jnp.asarray([joint.body_a for joint in joints], jnp.int32),
+        "body_b": jnp.asarray([joint.body_b for joint in joints], jnp.int32),
+        "anchor_a": _stack(joints, "anchor_a", (2,)),
+        "anchor_b": _stack(joints, "anchor_b", (2,)),
+    }
+
+
+def _body_slots(
+    constraints: Sequence[ConstraintSpec],
+    kind: str,
+    num_bodies: int,
+    shapes: dict[str, tuple[int, ...]],
+) -> dict[str, jax.Array]:
+    """Slots of a kind that belongs to one body, as many as the busiest body needs."""
+    of_body = [
+        [c for c in constraints if c.kind == kind and c.body_a == body]
+        for body in range(num_bodies)
+    ]
+    num_slots = max(map(len, of_body))
+    active = np.zeros((num_bodies, num_slots), bool)
+    arrays = {
+        key: np.zeros((num_bodies, num_slots, *shape)) for key, shape in shapes.items()
+    }
+    for body, own in enumerate(of_body):
+        active[body, : len(own)] = True
+        for slot, constraint in enumerate(own):
+            for key, array in arrays.items():
+                array[body, slot] = constraint.numbers[key]
+    return {
+        "active": jnp.asarray(active),
+        **{key: jnp.asarray(array, float) for key, array in arrays.items()},
+    }

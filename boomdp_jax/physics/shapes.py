@@ -1,0 +1,166 @@
+"""Area, centroid and second moments of convex outlines, and where they stand."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+_ANGLE_TOLERANCE = 1e-9
+"""Turn at a corner that still counts as straight [rad]; covers rounding in files."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ShapeMoments:
+    """What a uniform density makes of an outline, per unit of density."""
+
+    area: float
+    """Area of the outline [m²]."""
+    centroid: Float[np.ndarray, "2"]
+    """Centre of the area, outline frame [m]."""
+    covariance: Float[np.ndarray, "2 2"]
+    """Mean of the outer product of positions about the centroid [m²]."""
+
+    @property
+    def gyration(self) -> float:
+        """Squared radius of gyration about the centroid, inertia over mass [m²]."""
+        return float(np.trace(self.covariance))
+
+
+def polygon_moments(vertices: Float[np.ndarray, "vertex 2"]) -> ShapeMoments:
+    r"""Integrate over a polygon, as a fan of triangles from its first corner.
+
+    With corners $p_i$ relative to the first one and $c_i = p_i \times p_{i+1}$,
+    $$A = \tfrac12 \sum_i c_i, \quad A\,\bar p = \tfrac16 \sum_i c_i (p_i + p_{i+1}),
+    \quad \int p\,p^T = \tfrac1{24} \sum_i c_i
+        (2 p_i p_i^T + 2 p_{i+1} p_{i+1}^T + p_i p_{i+1}^T + p_{i+1} p_i^T).$$
+
+    Args:
+        vertices: corners, counter-clockwise [m].
+
+    Returns:
+        The moments of the polygon.
+    """
+    p = vertices - vertices[0]
+    q = np.roll(p, -1, axis=0)
+    c = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
+    area = 0.5 * np.sum(c)
+    centre = np.einsum("i,ij->j", c, p + q) / (6.0 * area)
+    second = 2.0 * _weighted_outer(c, p, p) + 2.0 * _weighted_outer(c, q, q)
+    second = second + _weighted_outer(c, p, q) + _weighted_outer(c, q, p)
+    covariance = second / (24.0 * area) - np.outer(centre, centre)
+    return ShapeMoments(float(area), vertices[0] + centre, covariance)
+
+
+def circle_moments(radius: float) -> ShapeMoments:
+    r"""Moments of a disc: $A = \pi r^2$, and $r^2/4$ along each axis.
+
+    Args:
+        radius: radius of the disc [m].
+
+    Returns:
+        The moments of the disc.
+    """
+    return ShapeMoments(
+        float(np.pi * radius**2), np.zeros(2), np.eye(2) * radius**2 / 4.0
+    )
+
+
+def box_outline(half_extents: Float[np.ndarray, "2"]) -> Float[np.ndarray, "4 2"]:
+    """Corners of a rectangle about the origin, counter-clockwise.
+
+    Args:
+        half_extents: half of its width and of its height [m].
+
+    Returns:
+        The corners, from the lower left one [m].
+    """
+    signs = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    return signs * half_extents
+
+
+def check_outline(vertices: Float[np.ndarray, "vertex 2"]) -> None:
+    """Make sure that an outline is convex, counter-clockwise and has an area.
+
+    Corners on a straight edge are allowed, corners that coincide are not.
+
+    Args:
+        vertices: corners of the outline [m].
+
+    Raises:
+        ValueError: what the outline is instead.
+    """
+    if len(vertices) < 3:
+        raise ValueError(f"expected at least 3 corners, got {len(vertices)}")
+    edges = np.roll(vertices, -1, axis=0) - vertices
+    lengths = np.hypot(edges[:, 0], edges[:, 1])
+    if not np.all(lengths > 0):
+        corner = int(np.argmin(lengths))
+        raise ValueError(
+            f"expected distinct corners, got {vertices[corner].tolist()} twice"
+        )
+    before, after = edges / lengths[:, None], np.roll(edges / lengths[:, None], -1, 0)
+    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    turn = np.arctan2(cross, np.sum(before * after, axis=-1))
+    if np.isclose(np.sum(turn), -2.0 * np.pi) and np.all(turn <= _ANGLE_TOLERANCE):
+        raise ValueError("expected corners counter-clockwise, got them clockwise")
+    is_left = (turn >= -_ANGLE_TOLERANCE) & (turn < np.pi - _ANGLE_TOLERANCE)
+    if not np.all(is_left):
+        corner = (int(np.argmin(is_left)) + 1) % len(vertices)
+        raise ValueError(
+            "expected a convex outline, counter-clockwise, got one that turns in at "
+            f"corner {corner}, {vertices[corner].tolist()}"
+        )
+    if not np.isclose(np.sum(turn), 2.0 * np.pi):
+        raise ValueError("expected a convex outline, got one that winds more than once")
+
+
+def support_points(moments: ShapeMoments) -> Float[np.ndarray, "4 2"]:
+    """Four feet whose second moments are those of the outline.
+
+    They stand at (±s1, ±s2) along the principal axes, with s_i the square root of the
+    second moment over the area, so that under equal loads the friction torque of a
+    slow spin is close to that of the whole area. Used where a body gives no feet.
+
+    Args:
+        moments: moments of the outline.
+
+    Returns:
+        The feet about the centre of mass, along the outline's axes [m].
+    """
+    squares, axes = np.linalg.eigh(moments.covariance)
+    return box_outline(np.sqrt(np.maximum(squares, 0.0))) @ axes.T
+
+
+def foot_loads(feet: Float[np.ndarray, "foot 2"]) -> Float[np.ndarray, " foot"]:
+    """Shares of the weight that balance about the centre of mass.
+
+    Of all shares whose centre is the centre of mass, the most even ones (least sum of
+    squares); a foot that would have to pull carries nothing. Where no shares balance
+    (the body leans on something else as well) all feet carry the same.
+
+    Args:
+        feet: feet relative to the centre of mass [m].
+
+    Returns:
+        The shares, which sum to one.
+    """
+    num_feet, reach = len(feet), np.max(np.abs(feet), initial=1e-12)
+    rows = np.concatenate([np.ones((num_feet, 1)), feet / reach], axis=1).T
+    carries = np.ones(num_feet, bool)
+    while np.any(carries):
+        load = np.zeros(num_feet)
+        load[carries] = np.linalg.pinv(rows[:, carries]) @ np.array([1.0, 0.0, 0.0])
+        if not np.allclose(rows @ load, [1.0, 0.0, 0.0], atol=1e-9):
+            break
+        if np.all(load >= -1e-12):
+            return np.maximum(load, 0.0) / np.sum(np.maximum(load, 0.0))
+        carries[np.argmin(load)] = False
+    return np.full(num_feet, 1.0 / num_feet)
+
+
+def _weighted_outer(
+    weight: Float[np.ndarray, " vertex"],
+    left: Float[np.ndarray, "vertex 2"],
+    right: Float[np.ndarray, "vertex 2"],
+) -> Float[np.ndarray, "2 2"]:
+    return np.einsum("i,ij,ik->jk", weight, left, right)
