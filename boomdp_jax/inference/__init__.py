@@ -1,0 +1,23 @@
+"""From a history to a posterior over Φ and over which constraints exist."""
+
+from boomdp_jax.inference.infer import METHODS as METHODS
+from boomdp_jax.inference.infer import infer as infer
+from boomdp_jax.inference.infer import infer_batch as infer_batch
+from boomdp_jax.inference.laplace_mixture import LaplaceMixture as LaplaceMixture
+from boomdp_jax.inference.posterior import Posterior as Posterior
+from boomdp_jax.inference.posterior import load_posterior as load_posterior
+from boomdp_jax.inference.predict import predict as predict
+from boomdp_jax.inference.structure_kernel import StructureKernel as StructureKernel
+from boomdp_jax.inference.target import StructureTarget as StructureTarget
+
+__all__ = [
+    "METHODS",
+    "LaplaceMixture",
+    "Posterior",
+    "StructureKernel",
+    "StructureTarget",
+    "infer",
+    "infer_batch",
+    "load_posterior",
+    "predict",
+]

@@ -1,0 +1,222 @@
+"""Draws of blocks put together: one posterior of the whole scene."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from boomdp_jax.core.arrays import Key
+from boomdp_jax.inference.block import Block
+from boomdp_jax.inference.one_step import NOISE_SHAPE
+from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.sample import BlockDraws
+from boomdp_jax.physics.params import WORLD, Params, empty_params
+from boomdp_jax.physics.scene_spec import SceneSpec
+
+NUM_PRIOR_DRAWS = 4096
+"""Prior draws that a posterior carries, to judge what was identified."""
+
+
+class BlockResult(NamedTuple):
+    """A block and its place in a batch of draws."""
+
+    block: Block
+    draws: BlockDraws
+    place: int
+
+
+@eqx.filter_jit
+def _decode(coordinates, z, active):
+    return jax.vmap(coordinates)(z, active)
+
+
+def assemble_posterior(
+    key: Key,
+    spec: SceneSpec,
+    results: list[BlockResult],
+    *,
+    seconds: dict,
+    notes: list[str],
+    method: str,
+) -> Posterior:
+    """Put the draws of independent blocks side by side.
+
+    Args:
+        key: random key, for prior draws.
+        spec: the scene.
+        results: its blocks, each with as many draws.
+        seconds: wall time.
+        notes: what the user should know.
+        method: how the draws were made.
+
+    Returns:
+        The posterior of the whole scene.
+    """
+    num_chains = max((len(r.draws.chain_index) for r in results), default=1)
+    posterior_parts, prior_parts, noise_parts, prior_noise_parts = [], [], [], []
+    for number, result in enumerate(results):
+        block, draws, place = result
+        target = block.target
+        active = target.structures[draws.structure[place]]
+        likelihood: Any = target.log_likelihood
+        coordinates = likelihood.coordinates
+        posterior_parts.append(_decode(coordinates, draws.z[place], active))
+        prior_key, noise_key = jax.random.split(jax.random.fold_in(key, number))
+        z = _prior_coordinates(prior_key, target)
+        every = jnp.ones((NUM_PRIOR_DRAWS, target.structures.shape[1]), bool)
+        prior_parts.append(_decode(coordinates, z, every))
+        noise_parts.append(draws.noise_scale[place])
+        shape = (NUM_PRIOR_DRAWS, len(block.bodies), 4)
+        scale = coordinates.scales.noise
+        prior_noise_parts.append(
+            scale[None, None]
+            / jnp.sqrt(jax.random.gamma(noise_key, NOISE_SHAPE, shape))
+        )
+    blocks = [r.block for r in results]
+    params, inferred = _merge(spec, blocks, posterior_parts)
+    prior_params, _ = _merge(spec, blocks, prior_parts)
+    num_draws = params.density.shape[0]
+    return Posterior(
+        params=params,
+        noise_scale=_merge_noise(spec, blocks, noise_parts, num_draws),
+        log_weight=jnp.full(num_draws, -np.log(num_draws)),
+        log_density=sum(
+            (r.draws.log_density[r.place] for r in results), start=jnp.zeros(num_draws)
+        ),
+        chain=jnp.repeat(jnp.arange(num_chains), num_draws // num_chains)
+        if not results
+        else jnp.asarray(results[0].draws.chain_index).repeat(
+            num_draws // len(results[0].draws.chain_index)
+        ),
+        prior_params=prior_params,
+        prior_noise_scale=_merge_noise(
+            spec, blocks, prior_noise_parts, prior_params.density.shape[0]
+        ),
+        inferred=inferred,
+        spec=spec,
+        log_evidence=sum((float(r.draws.log_evidence[r.place]) for r in results), 0.0),
+        diagnostics=_diagnostics(spec, results, notes, method),
+        seconds=seconds,
+    )
+
+
+def _prior_coordinates(key: Key, target):
+    normal_key, angle_key = jax.random.split(key)
+    shape = (NUM_PRIOR_DRAWS, target.dim)
+    period = target.period[None]
+    angle = period * (jax.random.uniform(angle_key, shape) - 0.5)
+    return jnp.where(period > 0, angle, jax.random.normal(normal_key, shape))
+
+
+def _merge(
+    spec: SceneSpec, blocks: list[Block], parts: list[Params]
+) -> tuple[Params, dict[str, np.ndarray]]:
+    """Params of the scene from those of its blocks, and which slots are inferred."""
+    num_draws = parts[0].density.shape[0] if parts else 1
+    num_joints = {
+        kind: sum(block.layout.count(kind) for block in blocks)
+        for kind in ("revolute", "distance")
+    }
+    num_each = {
+        kind: max((block.layout.count(kind) for block in blocks), default=0)
+        for kind in ("wheel", "ground")
+    }
+    whole = empty_params(
+        spec.num_bodies,
+        num_revolute=num_joints["revolute"],
+        num_distance=num_joints["distance"],
+        num_wheel=num_each["wheel"],
+        num_ground=num_each["ground"],
+    )
+    arrays = jax.tree.map(
+        lambda leaf: np.broadcast_to(np.asarray(leaf), (num_draws, *leaf.shape)).copy(),
+        whole,
+    )
+    fields: dict[str, dict[str, np.ndarray]] = {
+        kind: dict(vars(getattr(arrays, kind)))
+        for kind in ("revolute", "distance", "wheel", "ground")
+    }
+    shape = (num_draws, spec.num_bodies)
+    fields["wheel"]["half_track"] = np.zeros((*shape, num_each["wheel"]))
+    fields["ground"]["torque_share"] = np.zeros((*shape, num_each["ground"]))
+    fields["ground"]["load_shift"] = np.zeros((*shape, num_each["ground"], 2))
+    inferred = {
+        kind: np.zeros(fields[kind]["active"].shape[1:], bool) for kind in fields
+    }
+    density = np.array(arrays.density)
+    first = {"revolute": 0, "distance": 0}
+    for block, part in zip(blocks, parts, strict=True):
+        index = np.asarray(block.bodies)
+        density[:, index] = np.asarray(part.density)
+        to_scene = np.append(index, WORLD)
+        for kind in fields:
+            block_fields = vars(getattr(part, kind))
+            count = block.layout.count(kind)
+            for name, values in block_fields.items():
+                values = np.asarray(values)
+                if kind in first:
+                    rows = slice(first[kind], first[kind] + count)
+                    if name in ("body_a", "body_b"):
+                        values = to_scene[values]
+                    fields[kind][name][:, rows] = values
+                else:
+                    fields[kind][name][:, index, :count] = values
+        for slot in block.layout.slots:
+            if slot.kind in first:
+                inferred[slot.kind][first[slot.kind] + slot.index] = True
+            else:
+                inferred[slot.kind][index[slot.body_a], slot.index] = True
+        for kind in first:
+            first[kind] += block.layout.count(kind)
+    dtype = whole.density.dtype
+
+    def build(kind: str) -> Any:
+        kwargs = {
+            name: jnp.asarray(
+                value, dtype if np.issubdtype(value.dtype, np.floating) else None
+            )
+            for name, value in fields[kind].items()
+        }
+        return type(getattr(whole, kind))(**kwargs)
+
+    params = Params(
+        density=jnp.asarray(density, dtype),
+        revolute=build("revolute"),
+        distance=build("distance"),
+        wheel=build("wheel"),
+        ground=build("ground"),
+    )
+    return params, inferred
+
+
+def _merge_noise(spec: SceneSpec, blocks: list[Block], parts: list, num_draws: int):
+    out = np.ones((num_draws, spec.num_bodies, 4))
+    for block, part in zip(blocks, parts, strict=True):
+        out[:, np.asarray(block.bodies)] = np.asarray(part)
+    return jnp.asarray(out, float)
+
+
+def _diagnostics(
+    spec: SceneSpec, results: list[BlockResult], notes: list[str], method: str
+) -> dict:
+    """Verdict over all blocks, with the worst of every number."""
+    reasons, r_hat, sizes, jumps = [], [], [], []
+    for block, draws, place in results:
+        names = "+".join(spec.names[i] for i in block.bodies)
+        verdict = draws.diagnostics[place]
+        reasons += [f"{names}: {reason}" for reason in verdict.reasons]
+        r_hat += list(verdict.r_hat.values())
+        sizes += list(verdict.effective_sample_size.values())
+        if "jump" in verdict.acceptance:
+            jumps.append(verdict.acceptance["jump"])
+    return {
+        "ok": not reasons,
+        "reasons": reasons,
+        "notes": list(notes),
+        "method": method,
+        "r_hat": max(r_hat, default=1.0),
+        "effective_sample_size": min(sizes, default=0.0),
+        "jump_acceptance": min(jumps, default=None),
+    }

@@ -1,0 +1,123 @@
+"""Whether chains over structures can be trusted: R-hat and effective sample sizes.
+
+A slot's coordinates are zero where it is not active, so their R-hat says nothing over
+structures. It is taken of the log-density, of each slot's indicator that is not
+constant, of any scalar that the caller adds (a total mass, a prediction), and of
+coordinates within the most probable structure.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpyro.diagnostics import effective_sample_size, split_gelman_rubin
+
+from boomdp_jax.inference.moves import MOVES
+from boomdp_jax.inference.structure_chain import ChainDraws, RunInfo
+from boomdp_jax.inference.target import StructureTarget
+
+
+class ChainDiagnostics(NamedTuple):
+    """Verdict, reasons and the numbers behind."""
+
+    ok: bool
+    reasons: list[str]
+    r_hat: dict[str, float]
+    effective_sample_size: dict[str, float]
+    acceptance: dict[str, float]
+    """Share of proposals accepted by each move that was made, and by those that change
+    the structure, as `<move>_structure`."""
+
+
+def diagnose_chains(
+    target: StructureTarget,
+    draws: ChainDraws,
+    info: RunInfo | None = None,
+    *,
+    scalars: dict[str, Float[Array, "chain draw"]] | None = None,
+    max_r_hat: float = 1.05,
+    min_sample_size: float = 100.0,
+) -> ChainDiagnostics:
+    """Judge draws of several chains of one object; host side.
+
+    Args:
+        target: says which slots a structure has.
+        draws: of `run_chains`.
+        info: of `run_chains`; adds acceptance rates and the check for stuck chains.
+        scalars: further numbers that mean the same in every structure.
+        max_r_hat: largest split R-hat that passes.
+        min_sample_size: smallest effective sample size that passes.
+
+    Returns:
+        The verdict. `ok` is false with a reason for every number that fails, for a
+        log-density that is not finite, and for a chain that never moved.
+    """
+    structure = np.asarray(draws.structure)
+    log_density = np.asarray(draws.log_density)
+    reasons = []
+    if not np.all(np.isfinite(log_density)):
+        reasons.append("log-density: some draws are not finite")
+    series = {"log_density": np.where(np.isfinite(log_density), log_density, -1e30)}
+    active = np.asarray(target.structures)[structure]
+    for slot in range(active.shape[-1]):
+        series[f"slot_{slot}"] = active[..., slot].astype(float)
+    series |= {name: np.asarray(value) for name, value in (scalars or {}).items()}
+    series = {name: value for name, value in series.items() if np.ptp(value) > 0}
+    series |= _within_structure(target, structure, np.asarray(draws.z))
+    r_hat = {name: float(split_gelman_rubin(value)) for name, value in series.items()}
+    size = {name: float(effective_sample_size(value)) for name, value in series.items()}
+    for name in series:
+        if not r_hat[name] <= max_r_hat:
+            reasons.append(f"{name}: R-hat is {r_hat[name]:.3f}, above {max_r_hat}")
+        if not size[name] >= min_sample_size:
+            reasons.append(
+                f"{name}: effective sample size is {size[name]:.0f}, below "
+                f"{min_sample_size:.0f}"
+            )
+    stuck = np.flatnonzero(np.ptp(log_density, axis=1) == 0)
+    if stuck.size:
+        reasons.append(f"chains {stuck.tolist()} never moved")
+    acceptance = {} if info is None else _acceptance(info)
+    return ChainDiagnostics(not reasons, reasons, r_hat, size, acceptance)
+
+
+def _within_structure(
+    target: StructureTarget, structure: np.ndarray, z: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Coordinates of the commonest structure, chains cut to equal length.
+
+    Angles enter by sine and cosine, which do not jump where an angle is wrapped.
+    """
+    commonest = int(np.argmax(np.bincount(structure.ravel())))
+    num_each = np.sum(structure == commonest, axis=1)
+    length = int(num_each.min())
+    if length < 8:
+        return {}
+    rows = [
+        chain_z[chain_structure == commonest][:length]
+        for chain_z, chain_structure in zip(z, structure, strict=True)
+    ]
+    kept, period = np.stack(rows), np.asarray(target.period)
+    series = {}
+    for index in np.flatnonzero(np.asarray(target.in_use(jnp.asarray(commonest)))):
+        value = kept[..., index]
+        if period[index] > 0:
+            turn = 2.0 * np.pi * value / period[index]
+            series[f"z_{index}_cos"] = np.cos(turn)
+            series[f"z_{index}_sin"] = np.sin(turn)
+        else:
+            series[f"z_{index}"] = value
+    return {name: value for name, value in series.items() if np.ptp(value) > 0}
+
+
+def _acceptance(info: RunInfo) -> dict[str, float]:
+    proposed = np.sum(np.asarray(info.proposed), axis=0)
+    accepted = np.sum(np.asarray(info.accepted), axis=0)
+    rates = {}
+    for index, name in enumerate(MOVES):
+        if proposed[index].sum() > 0:
+            rates[name] = float(accepted[index].sum() / proposed[index].sum())
+        if proposed[index, 1] > 0:
+            rates[f"{name}_structure"] = float(accepted[index, 1] / proposed[index, 1])
+    return rates

@@ -1,0 +1,185 @@
+"""From scenes and histories to posteriors: the one call that most users need."""
+
+import time
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+
+from boomdp_jax.core.arrays import Key
+from boomdp_jax.core.history import History
+from boomdp_jax.inference.assemble import BlockResult, assemble_posterior
+from boomdp_jax.inference.block import Block, make_block, stack_blocks
+from boomdp_jax.inference.components import independent_blocks
+from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.sample import SampleSettings, sample_blocks
+from boomdp_jax.physics.scene_spec import SceneSpec
+
+METHODS = ("auto", "rj")
+"""Ways to infer: `auto` is `rj` until something better exists."""
+
+
+def infer(
+    key: Key,
+    spec: SceneSpec,
+    history: History,
+    *,
+    method: str = "auto",
+    num_chains: int = 4,
+    num_warmup: int = 200,
+    num_samples: int = 500,
+    progress: bool = False,
+) -> Posterior:
+    """Posterior over densities, joints, wheels, friction, noise, and which exist.
+
+    Args:
+        key: random key.
+        spec: the scene: outlines, what is known, what may exist.
+        history: recorded transitions. An empty one gives the prior.
+        method: `rj`, reversible jump over structures, or `auto`.
+        num_chains: chains, run side by side.
+        num_warmup: iterations of each that adapt and are thrown away.
+        num_samples: iterations of each that are kept.
+        progress: show stages on standard error.
+
+    Returns:
+        Draws of all chains, with diagnostics.
+
+    Raises:
+        ValueError: an unknown method, a history of another number of bodies, a scene
+            with more structures than can be told apart, a prior that makes no sense.
+    """
+    return infer_batch(
+        key,
+        [spec],
+        [history],
+        method=method,
+        num_chains=num_chains,
+        num_warmup=num_warmup,
+        num_samples=num_samples,
+        progress=progress,
+    )[0]
+
+
+def infer_batch(
+    key: Key,
+    specs: Sequence[SceneSpec],
+    histories: Sequence[History],
+    *,
+    method: str = "auto",
+    num_chains: int = 4,
+    num_warmup: int = 200,
+    num_samples: int = 500,
+    progress: bool = False,
+) -> list[Posterior]:
+    """The same for many scenes; equal blocks of bodies share one compiled call.
+
+    Args:
+        key: random key.
+        specs: the scenes.
+        histories: one for each scene.
+        method: as in `infer`.
+        num_chains: as in `infer`.
+        num_warmup: as in `infer`.
+        num_samples: as in `infer`.
+        progress: show stages on standard error.
+
+    Returns:
+        One posterior per scene.
+
+    Raises:
+        ValueError: as in `infer`; or not as many histories as scenes.
+    """
+    if method not in METHODS:
+        raise ValueError(
+            f"method: expected one of {', '.join(METHODS)}; got {method!r}"
+        )
+    if len(specs) != len(histories):
+        raise ValueError(
+            f"histories: expected one per scene, {len(specs)}, got {len(histories)}"
+        )
+    for spec, history in zip(specs, histories, strict=True):
+        _check(spec, history)
+    settings = SampleSettings(num_chains, num_warmup, num_samples)
+    start = time.perf_counter()
+    problems, notes = [], []
+    for index, (spec, history) in enumerate(zip(specs, histories, strict=True)):
+        blocks, screened = independent_blocks(spec, history)
+        notes.append(screened)
+        problems += [(index, make_block(spec, b, history)) for b in blocks]
+    results: dict[int, list[BlockResult]] = {i: [] for i in range(len(specs))}
+    groups = _group(problems)
+    with _Bar(progress, len(problems)) as bar:
+        for number, members in enumerate(groups):
+            group_key = jax.random.fold_in(key, number)
+            stacked = stack_blocks([block for _, block in members])
+            draws = sample_blocks(group_key, stacked, settings, bar.stage)
+            for place, (index, block) in enumerate(members):
+                results[index].append(BlockResult(block, draws, place))
+            bar.advance(len(members))
+    seconds = {"compile": None, "run": time.perf_counter() - start}
+    return [
+        assemble_posterior(
+            jax.random.fold_in(key, len(groups) + index),
+            spec,
+            results[index],
+            seconds=dict(seconds),
+            notes=notes[index],
+            method="rj" if method == "auto" else method,
+        )
+        for index, spec in enumerate(specs)
+    ]
+
+
+def _check(spec: SceneSpec, history: History) -> None:
+    if history.num_bodies != spec.num_bodies:
+        raise ValueError(
+            f"{spec.source}: history: expected {spec.num_bodies} bodies, got "
+            f"{history.num_bodies}"
+        )
+    for body in spec.bodies:
+        if body.is_center_unknown and not body.is_static:
+            raise ValueError(
+                f"{spec.source}: body {body.name!r}: center_of_mass: expected a known "
+                "one; inferring it is not supported yet"
+            )
+
+
+def _group(problems: list[tuple[int, Block]]) -> list[list[tuple[int, Block]]]:
+    """Blocks whose targets have the same static parts and array shapes."""
+    groups: dict[object, list[tuple[int, Block]]] = {}
+    for problem in problems:
+        arrays, static = eqx.partition(problem[1].target, eqx.is_array)
+        leaves, treedef = jax.tree.flatten(arrays)
+        shapes = tuple((leaf.shape, str(leaf.dtype)) for leaf in leaves)
+        signature = (shapes, treedef, str(jax.tree.structure(static)))
+        groups.setdefault(signature, []).append(problem)
+    return list(groups.values())
+
+
+class _Bar:
+    """Progress on standard error; nothing unless asked for."""
+
+    def __init__(self, is_shown: bool, num_blocks: int):
+        self._bar = None
+        if is_shown:
+            from tqdm import tqdm
+
+            self._bar = tqdm(total=num_blocks, unit="block", desc="infer")
+
+    def stage(self, name: str) -> None:
+        """Say what is being done."""
+        if self._bar is not None:
+            self._bar.set_postfix_str(name)
+
+    def advance(self, num: int) -> None:
+        """So many blocks are done."""
+        if self._bar is not None:
+            self._bar.update(num)
+
+    def __enter__(self) -> "_Bar":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.close()

@@ -1,0 +1,172 @@
+"""Which constraints may exist in a block of bodies, and which coordinate means what."""
+
+import itertools
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from boomdp_jax.inference.prior import PriorOptions
+from boomdp_jax.physics.params import WORLD
+from boomdp_jax.physics.scene_spec import SceneSpec
+
+NUM_COORDINATES = {"revolute": 6, "distance": 5, "wheel": 8, "ground": 5}
+"""Coordinates of one constraint of each kind; see `coordinates.py` for their order."""
+
+HEADING = 2
+"""Which coordinate of a wheel is its heading."""
+
+_MAX_STRUCTURES = 4096
+
+
+class SlotKey(NamedTuple):
+    """One place in `Params` that a constraint may take."""
+
+    kind: str
+    body_a: int
+    body_b: int
+    index: int
+    """Joint slot for revolute and distance; slot of its body for wheel and ground."""
+    start: int
+    """First coordinate."""
+    known: int
+    """Entry of the scene's constraints that lies here; -1: inferred."""
+
+
+class Layout(NamedTuple):
+    """Slots and coordinates of a block; static, so that equal blocks share a program.
+
+    Coordinates: the log-density of each body, then those of each slot.
+    """
+
+    num_bodies: int
+    slots: tuple[SlotKey, ...]
+    """Inferred slots; a structure says which of them are active."""
+    known_slots: tuple[SlotKey, ...]
+    """Slots of constraints that are known to exist."""
+    dim: int
+
+    def count(self, kind: str) -> int:
+        """How many slots of a kind `Params` needs (per body for wheel and ground)."""
+        slots = [s for s in self.slots + self.known_slots if s.kind == kind]
+        return max((s.index for s in slots), default=-1) + 1
+
+    def slot_of_coordinate(self) -> np.ndarray:
+        """Slot of each coordinate, `[dim]`; -1: of no inferred slot."""
+        out = np.full(self.dim, -1)
+        for i, slot in enumerate(self.slots):
+            out[slot.start : slot.start + NUM_COORDINATES[slot.kind]] = i
+        return out
+
+    def period(self) -> np.ndarray:
+        """Period of each coordinate, `[dim]`: pi for headings, else 0."""
+        out = np.zeros(self.dim)
+        for slot in self.slots + self.known_slots:
+            if slot.kind == "wheel":
+                out[slot.start + HEADING] = math.pi
+        return out
+
+
+def block_layout(spec: SceneSpec, bodies: tuple[int, ...]) -> Layout:
+    """Lay out the constraints that a block of bodies may have.
+
+    Args:
+        spec: the scene.
+        bodies: indices of the block's bodies in the scene, ascending.
+
+    Returns:
+        The layout; its body indices count within the block.
+    """
+    place = {body: i for i, body in enumerate(bodies)}
+    start = len(bodies)
+    counts = {"revolute": 0, "distance": 0}
+    per_body = {
+        (kind, i): 0 for kind in ("wheel", "ground") for i in range(len(bodies))
+    }
+    known, inferred = [], []
+
+    def add(out, kind, a, b, entry):
+        nonlocal start
+        if kind in counts:
+            index = counts[kind]
+            counts[kind] += 1
+        else:
+            index = per_body[kind, a]
+            per_body[kind, a] += 1
+        out.append(SlotKey(kind, a, b, index, start, entry))
+        start += NUM_COORDINATES[kind]
+
+    for entry, constraint in enumerate(spec.constraints):
+        if constraint.body_a in place:
+            partner = place.get(constraint.body_b, WORLD)
+            add(known, constraint.kind, place[constraint.body_a], partner, entry)
+    is_loaded = spec.normal_gravity > 0
+    movable = [i for i, body in enumerate(bodies) if not spec.is_static[body]]
+    for kind in ("revolute", "distance", "wheel", "ground"):
+        if kind in ("wheel", "ground") and not is_loaded:
+            continue  # What carries no load has no friction with the floor.
+        for i in movable:
+            for _ in range(spec.unknown.get(kind, 0)):
+                add(inferred, kind, i, WORLD, -1)
+    for kind in ("revolute", "distance"):
+        if spec.unknown.get(kind, 0):
+            for i, j in itertools.combinations(movable, 2):
+                add(inferred, kind, i, j, -1)
+    return Layout(len(bodies), tuple(inferred), tuple(known), start)
+
+
+def structures(
+    layout: Layout, caps: dict[str, int], options: PriorOptions
+) -> tuple[np.ndarray, np.ndarray]:
+    """Every structure that a block may have, and its prior.
+
+    Each optional constraint is present independently, truncated to the caps. Of slots
+    that could be exchanged only the canonical choice is listed: the first ones are in
+    use.
+
+    Args:
+        layout: slots of the block.
+        caps: most inferred constraints of each kind that one body may have.
+        options: probabilities.
+
+    Returns:
+        Active slots, `[structure, slot]`, and normalised log-probabilities.
+
+    Raises:
+        ValueError: more structures than can be told apart one by one.
+    """
+    groups: dict[tuple, list[int]] = {}
+    for i, slot in enumerate(layout.slots):
+        groups.setdefault((slot.kind, slot.body_a, slot.body_b), []).append(i)
+    sizes = [len(group) + 1 for group in groups.values()]
+    if math.prod(sizes) > _MAX_STRUCTURES:
+        raise ValueError(
+            f"unknown: {math.prod(sizes)} structures of a block of "
+            f"{layout.num_bodies} bodies; expected at most {_MAX_STRUCTURES}; lower "
+            "the caps in 'unknown'"
+        )
+    rows, weights = [], []
+    for counts in itertools.product(*(range(size) for size in sizes)):
+        used: dict[tuple, int] = {}
+        weight, row = 0.0, np.zeros(len(layout.slots), bool)
+        for ((kind, a, b), group), count in zip(groups.items(), counts, strict=True):
+            is_tie = b != WORLD
+            p = options.probability["tie" if is_tie else kind]
+            for body in (a, b) if is_tie else (a,):
+                used[kind, body] = used.get((kind, body), 0) + count
+            row[group[:count]] = True
+            weight += math.log(math.comb(len(group), count))
+            weight += _log_power(p, count) + _log_power(1 - p, len(group) - count)
+        if weight > -math.inf and all(
+            count <= caps.get(kind, 0) for (kind, _), count in used.items()
+        ):
+            rows.append(row)
+            weights.append(weight)
+    log_prior = np.array(weights)
+    return np.stack(rows), log_prior - np.logaddexp.reduce(log_prior)
+
+
+def _log_power(p: float, count: int) -> float:
+    if count == 0:
+        return 0.0
+    return count * math.log(p) if p > 0 else -math.inf

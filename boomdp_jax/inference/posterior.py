@@ -1,0 +1,358 @@
+"""What is known after the data: weighted draws of Φ and noise, with names and scene."""
+
+import importlib
+import importlib.metadata
+import os
+from collections.abc import Iterable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from boomdp_jax.core.arrays import FloatScalar, Key
+from boomdp_jax.core.history import History
+from boomdp_jax.inference.posterior_file import (
+    read_posterior_file,
+    write_posterior_file,
+)
+from boomdp_jax.inference.posterior_report import (
+    SCHEMA,
+    format_report,
+    report_bodies,
+    report_known,
+    report_noise,
+    report_structures,
+    structure_probabilities,
+)
+from boomdp_jax.inference.summary import plain
+from boomdp_jax.physics import step
+from boomdp_jax.physics.params import Params
+from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
+from boomdp_jax.physics.state import State, state_from_array
+
+
+class Record(dict):
+    """A dictionary that compares and hashes by identity, as static fields must."""
+
+    __hash__ = object.__hash__
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+    def __ne__(self, other: object) -> bool:
+        return self is not other
+
+
+def _record(value: dict) -> Record:
+    return value if isinstance(value, Record) else Record(value)
+
+
+def _scalar(value: float | Array) -> FloatScalar:
+    return jnp.asarray(value, float)
+
+
+def library_versions() -> dict[str, str]:
+    """Versions of what computes a posterior, as result files record them."""
+    names = ("boomdp_jax", "jax", "jaxlib", "numpyro", "equinox", "numpy")
+    versions = {}
+    for name in names:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    return versions
+
+
+class Posterior(eqx.Module):
+    """Weighted draws from P(Φ, σ | h), whatever method they come from.
+
+    Draws of all chains lie one after the other. Which slots are active differs from
+    draw to draw: that is the uncertainty about structure.
+    """
+
+    params: Params
+    """Draws of Φ, leading axis `draw`."""
+    noise_scale: Float[Array, "draw body 4"]
+    """Sd of one reading: position [m], angle [rad], velocity [m/s], spin [rad/s]."""
+    log_weight: Float[Array, " draw"]
+    """Normalised."""
+    log_density: Float[Array, " draw"]
+    """Unnormalised log-posterior density, as the method reports it."""
+    chain: Int[Array, " draw"]
+    """Chain that a draw comes from."""
+    prior_params: Params
+    """Prior draws, leading axis of their own, with every inferable slot active."""
+    prior_noise_scale: Float[Array, "prior_draw body 4"]
+    """Prior draws of `noise_scale`."""
+    inferred: dict[str, np.ndarray] = eqx.field(static=True, converter=_record)
+    """Which slots are inferred rather than known: revolute and distance `[joint]`,
+    wheel `[body, wheel]`, ground `[body, ground]`."""
+    spec: SceneSpec = eqx.field(static=True)
+    """The scene that this is about; names the axes."""
+    log_evidence: FloatScalar = eqx.field(converter=_scalar, default=float("nan"))
+    """Log marginal likelihood; NaN where the method gives none."""
+    diagnostics: dict = eqx.field(
+        static=True,
+        converter=_record,
+        default_factory=lambda: {"ok": True, "reasons": []},
+    )
+    """`ok`, `reasons`, and the numbers behind them."""
+    seconds: dict = eqx.field(static=True, converter=_record, default_factory=dict)
+    """Wall time spent on `compile` and on `run` [s]."""
+    seed: int | None = eqx.field(static=True, default=None)
+    versions: dict = eqx.field(
+        static=True, converter=_record, default_factory=library_versions
+    )
+
+    @property
+    def num_draws(self) -> int:
+        """How many draws there are."""
+        return self.log_weight.shape[0]
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Weight of each draw; they sum to one, `[draw]`."""
+        log_weight = np.asarray(self.log_weight, np.float64)
+        weights = np.exp(log_weight - log_weight.max())
+        return weights / weights.sum()
+
+    def structure_probabilities(self) -> dict[str, float]:
+        """Probability of each structure by its readable name, most probable first."""
+        return structure_probabilities(
+            self.spec, _on_host(self.params), self.weights, self.inferred
+        )
+
+    def to_json(self) -> dict:
+        """The posterior in numbers, a `boomdp-infer-1` object.
+
+        Static bodies are left out. Anchors and wheel poses are in the frame of the
+        outline as authored. `known_constraints` lists constraints that the scene file
+        states with a number left open. What is not finite is None.
+        """
+        params, prior = _on_host(self.params), _on_host(self.prior_params)
+        weights = self.weights
+        report = {
+            "schema": SCHEMA,
+            "bodies": report_bodies(
+                self.spec,
+                np.asarray(params.density),
+                weights,
+                np.asarray(prior.density),
+            ),
+            "structure": report_structures(
+                self.spec, params, weights, prior, self.inferred
+            ),
+            "known_constraints": report_known(
+                self.spec, params, weights, prior, self.inferred
+            ),
+            "noise": report_noise(
+                self.spec,
+                np.asarray(self.noise_scale, np.float64),
+                weights,
+                np.asarray(self.prior_noise_scale, np.float64),
+            ),
+            "log_evidence": float(self.log_evidence),
+            "diagnostics": {"ok": True, "reasons": [], **self.diagnostics},
+            "seconds": {"compile": None, "run": None, **self.seconds},
+            "seed": self.seed,
+            "versions": dict(self.versions),
+        }
+        return plain(report)
+
+    def summary(self) -> str:
+        """A table for people: bodies, structures, constraints, noise, diagnostics."""
+        return format_report(
+            self.to_json(), self.structure_probabilities(), self.num_draws
+        )
+
+    def sample_indices(self, key: Key, num_samples: int) -> Int[Array, " sample"]:
+        """Draw places in the list of draws, by weight and independently."""
+        return jax.random.categorical(key, self.log_weight, shape=(num_samples,))
+
+    def sample_params(self, key: Key, num_samples: int) -> Params:
+        """Draw hypotheses by weight and independently, leading axis `num_samples`."""
+        chosen = self.sample_indices(key, num_samples)
+        return jax.tree.map(lambda leaf: leaf[chosen], self.params)
+
+    def thin(self, num_draws: int) -> "Posterior":
+        """Keep at most so many draws, stratified by cumulative weight.
+
+        The draws that are kept have equal weights; with fewer effective draws than
+        asked for, some occur more than once.
+        """
+        if num_draws < 1:
+            raise ValueError(f"num_draws: expected at least 1, got {num_draws}")
+        weights = self.weights
+        num_draws = min(num_draws, self.num_draws)
+        if num_draws == self.num_draws and np.ptp(weights) < 1e-6 / num_draws:
+            return self
+        cumulative = np.cumsum(weights)
+        # One draw at random, always the same, from each of so many equal shares: even
+        # spacing would resonate with a chain that has a period.
+        inside = np.random.default_rng(0).uniform(size=num_draws)
+        levels = (np.arange(num_draws) + inside) / num_draws
+        chosen = np.minimum(np.searchsorted(cumulative, levels), self.num_draws - 1)
+        kept = jax.tree.map(
+            lambda leaf: leaf[chosen],
+            (self.params, self.noise_scale, self.log_density, self.chain),
+        )
+        equal = jnp.full(num_draws, -np.log(num_draws), self.log_weight.dtype)
+        return eqx.tree_at(
+            lambda p: (p.params, p.noise_scale, p.log_density, p.chain, p.log_weight),
+            self,
+            (*kept, equal),
+        )
+
+    def transition(
+        self, key: Key, state: State, wrench: Float[Array, "body 3"]
+    ) -> State:
+        """Draw the next reading: the paper's generative process, one call.
+
+        Φ, σ ~ P(·|h); the state is stepped under Φ; noise of scale σ is added. Every
+        call draws a new hypothesis; a planner that keeps one down its tree takes it
+        from `sample_params`.
+
+        Args:
+            key: random key.
+            state: where the bodies are.
+            wrench: held over the scene's time step [N, N, N m].
+
+        Returns:
+            A reading of the next state.
+        """
+        draw_key, noise_key = jax.random.split(key)
+        chosen = self.sample_indices(draw_key, 1)[0]
+        params, noise_scale = jax.tree.map(
+            lambda leaf: leaf[chosen], (self.params, self.noise_scale)
+        )
+        with jax.ensure_compile_time_eval():
+            scene = self.spec.scene
+        next_state, _ = step(scene, params, state, wrench)
+        return add_reading_noise(noise_key, next_state, noise_scale, scene.is_static)
+
+    def predict(
+        self, history: History, horizons: Iterable[int] = (1, 10, 50), **options: Any
+    ) -> dict:
+        """Score predictions of held-out motion; see `inference.predict.predict`."""
+        from boomdp_jax.inference.predict import predict
+
+        return predict(self, history, horizons, **options)
+
+    def plot(
+        self, path: str | os.PathLike | None = None, history: History | None = None
+    ) -> Any:
+        """Draw the posterior on one figure, and write it where a path is given.
+
+        Args:
+            path: picture file to write; its ending says the format.
+            history: held-out motion to set predictions against.
+
+        Returns:
+            A `matplotlib.figure.Figure`.
+        """
+        # Pictures lie layers above: looked up when asked for, so that nothing here
+        # depends on them.
+        viz = importlib.import_module("boomdp_jax.viz")
+        return viz.plot_posterior(self, path, history=history)
+
+    def to_arviz(self) -> object:
+        """ArviZ's container, with dimensions named by body, joint and wheel."""
+        return importlib.import_module("boomdp_jax.interop.arviz").to_arviz(self)
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write an NPZ file with a JSON header that `load_posterior` reads."""
+        arrays = {
+            f"inferred.{kind}": np.asarray(slots, bool)
+            for kind, slots in self.inferred.items()
+        }
+        for name in _ARRAYS:
+            arrays[name] = np.asarray(getattr(self, name))
+        header = {
+            "scene": self.spec.to_dict(),
+            "diagnostics": plain(dict(self.diagnostics)),
+            "seconds": plain(dict(self.seconds)),
+            "seed": self.seed,
+            "versions": dict(self.versions),
+        }
+        write_posterior_file(path, arrays, self.params, self.prior_params, header)
+
+
+_ARRAYS = (
+    "noise_scale",
+    "log_weight",
+    "log_density",
+    "chain",
+    "prior_noise_scale",
+    "log_evidence",
+)
+
+
+def load_posterior(path: str | os.PathLike) -> Posterior:
+    """Read what `Posterior.save` wrote.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The posterior, the same to the bit on the float type that it was saved on.
+
+    Raises:
+        ValueError: not such a file, a damaged one, another schema, or shapes that do
+            not fit together; one line.
+        OSError: the file cannot be opened.
+    """
+    arrays, params, prior_params, header = read_posterior_file(path)
+    spec = scene_spec_from_dict(header["scene"], source=f"{path}: scene")
+    num_bodies = params.density.shape[1]
+    if num_bodies != len(spec.bodies):
+        raise ValueError(
+            f"{path}: expected draws of {len(spec.bodies)} bodies as in the scene, got "
+            f"{num_bodies}"
+        )
+    fields: dict[str, Any] = {name: jnp.asarray(arrays[name]) for name in _ARRAYS}
+    for name in ("diagnostics", "seconds", "seed", "versions"):
+        fields[name] = header[name]
+    fields["inferred"] = {
+        name.removeprefix("inferred."): array
+        for name, array in arrays.items()
+        if name.startswith("inferred.")
+    }
+    return Posterior(params=params, prior_params=prior_params, spec=spec, **fields)
+
+
+def add_reading_noise(
+    key: Key,
+    state: State,
+    noise_scale: Float[Array, "*#batch body 4"],
+    is_static: Bool[Array, " body"],
+) -> State:
+    """Add independent noise to readings; a static body has none.
+
+    Args:
+        key: random key.
+        state: true poses and twists.
+        noise_scale: sd of position [m], angle [rad], velocity [m/s], spin [rad/s].
+        is_static: which bodies are part of the room.
+
+    Returns:
+        The readings.
+    """
+    truth = state.array
+    scale = noise_scale[..., jnp.array([0, 0, 1, 2, 2, 3])]
+    scale = jnp.broadcast_to(scale, truth.shape)
+    scale = jnp.where(jnp.broadcast_to(is_static[:, None], truth.shape), 0.0, scale)
+    noise = jax.random.normal(key, truth.shape, truth.dtype)
+    return state_from_array(truth + scale * noise)
+
+
+def _on_host(params: Params) -> Params:
+    """Params as NumPy arrays, floats in double precision."""
+
+    def convert(leaf: Array) -> np.ndarray:
+        array = np.asarray(leaf)
+        return array.astype(np.float64) if array.dtype.kind == "f" else array
+
+    return jax.tree.map(convert, params)

@@ -1,0 +1,299 @@
+"""The whole posterior as one JSON object, and that object as a table for people."""
+
+from collections.abc import Mapping
+
+import jax
+import numpy as np
+
+from boomdp_jax.inference.structure_report import (
+    KINDS,
+    group_by_structure,
+    report_slots,
+    structure_name,
+)
+from boomdp_jax.inference.summary import CHANNELS, summarise
+from boomdp_jax.physics.params import Params
+from boomdp_jax.physics.scene_spec import SceneSpec
+
+SCHEMA = "boomdp-infer-1"
+
+_UNITS = {
+    "revolute": {"viscous": "N m s/rad", "dry": "N m"},
+    "distance": {},
+    "wheel": {"viscous": "N s/m", "dry": "N"},
+    "ground": {"viscous": "N s/m", "dry": ""},
+}
+_TITLES = {
+    "anchor_a": "anchor on a",
+    "anchor_b": "anchor on b",
+    "length": "length",
+    "pose": "place and heading",
+    "along_axle": "along its axle",
+    "across_axle": "across its axle",
+    "viscous": "viscous friction",
+    "dry": "dry friction limit",
+}
+_NOISE_UNITS = dict(zip(CHANNELS, ("m", "rad", "m/s", "rad/s"), strict=True))
+_LEAST_SHOWN = 0.001
+"""Probability below which a structure is left out of the table (not of the object)."""
+
+
+def report_bodies(
+    spec: SceneSpec,
+    density: np.ndarray,
+    weights: np.ndarray,
+    prior_density: np.ndarray,
+) -> dict:
+    """Density [kg/m²] and mass [kg] of every body that can move, by name.
+
+    A density that the scene file gives counts as identified.
+
+    Args:
+        spec: the scene.
+        density: draws, `[draw, body]`.
+        weights: of the draws, sum to one, `[draw]`.
+        prior_density: prior draws, `[draw, body]`.
+
+    Returns:
+        Marginal summaries over structure, and `identified`, which is the mass's.
+    """
+    report = {}
+    for index, body in enumerate(spec.bodies):
+        if body.is_static:
+            continue
+        prior = prior_density[:, index]
+        if body.density is not None:
+            prior = np.full(1, body.density)
+        value = density[:, index]
+        mass = summarise(value * body.area, weights, prior * body.area, "log")
+        report[body.name] = {
+            "density": summarise(value, weights, prior, "log"),
+            "mass": mass,
+            "identified": mass["identified"],
+        }
+    return report
+
+
+def report_noise(
+    spec: SceneSpec,
+    noise_scale: np.ndarray,
+    weights: np.ndarray,
+    prior_noise_scale: np.ndarray,
+) -> dict:
+    """Noise sd of every body's readings: position, angle, velocity, spin.
+
+    Args:
+        spec: the scene.
+        noise_scale: draws, `[draw, body, 4]` [m, rad, m/s, rad/s].
+        weights: of the draws, sum to one, `[draw]`.
+        prior_noise_scale: prior draws, like `noise_scale`.
+
+    Returns:
+        By name of each body that can move, then by channel, a summary.
+    """
+    return {
+        body.name: {
+            name: summarise(
+                noise_scale[:, index, channel],
+                weights,
+                prior_noise_scale[:, index, channel],
+                "log",
+            )
+            for channel, name in enumerate(CHANNELS)
+        }
+        for index, body in enumerate(spec.bodies)
+        if not body.is_static
+    }
+
+
+def report_structures(
+    spec: SceneSpec,
+    params: Params,
+    weights: np.ndarray,
+    prior_params: Params,
+    inferred: Mapping[str, np.ndarray],
+) -> list[dict]:
+    """Structures of the whole scene, most probable first, with their numbers.
+
+    Args:
+        spec: the scene.
+        params: draws, NumPy arrays with a leading draw axis.
+        weights: of the draws, sum to one, `[draw]`.
+        prior_params: prior draws with every inferable slot active.
+        inferred: by kind, which slots are inferred rather than known.
+
+    Returns:
+        `probability` and `constraints` of each; a constraint's numbers come from the
+        draws that have this structure.
+    """
+    shift, names = _shift(spec), tuple(spec.names)
+    report = []
+    for slots, probability, draws in group_by_structure(params, inferred, weights):
+        if probability <= 0:
+            continue
+        chosen = jax.tree.map(lambda leaf, draws=draws: leaf[draws], params)
+        weight = weights[draws] / weights[draws].sum()
+        constraints = []
+        for like in slots:
+            constraints += report_slots(
+                like, chosen, weight, inferred, prior_params, shift, names
+            )
+        report.append({"probability": probability, "constraints": constraints})
+    return report
+
+
+def report_known(
+    spec: SceneSpec,
+    params: Params,
+    weights: np.ndarray,
+    prior_params: Params,
+    inferred: Mapping[str, np.ndarray],
+) -> list[dict]:
+    """Constraints that are known to exist and have a number that is inferred.
+
+    Args and entries are those of `report_structures`.
+    """
+    known = {kind: ~inferred[kind] for kind in KINDS}
+    shift, names = _shift(spec), tuple(spec.names)
+    report = []
+    for slots, _, _ in group_by_structure(params, known, weights)[:1]:
+        for like in slots:
+            report += report_slots(
+                like, params, weights, known, prior_params, shift, names
+            )
+    return [entry for entry in report if _has_spread(entry)]
+
+
+def structure_probabilities(
+    spec: SceneSpec,
+    params: Params,
+    weights: np.ndarray,
+    inferred: Mapping[str, np.ndarray],
+) -> dict[str, float]:
+    """Probability of each structure by its readable name, most probable first."""
+    names = _moving_names(spec)
+    result: dict[str, float] = {}
+    for slots, probability, _ in group_by_structure(params, inferred, weights):
+        name = structure_name(slots, tuple(spec.names), is_single=len(names) == 1)
+        result[name] = result.get(name, 0.0) + probability
+    return result
+
+
+def format_report(report: dict, structures: dict[str, float], num_draws: int) -> str:
+    """Write a report as a table for people.
+
+    Args:
+        report: a `boomdp-infer-1` object.
+        structures: probability of each structure by name, most probable first.
+        num_draws: how many draws it rests on.
+
+    Returns:
+        Lines of text without a final newline.
+    """
+    lines = [f"{'body':<16}{'mass [kg]':<32}{'density [kg/m²]':<32}identified"]
+    for name, body in report["bodies"].items():
+        lines.append(
+            f"{name:<16}{_interval(body['mass']):<32}{_interval(body['density']):<32}"
+            f"{'yes' if body['identified'] else 'no: the prior'}"
+        )
+    lines += ["", f"{'structure':<48}probability"]
+    for name, probability in structures.items():
+        if probability >= _LEAST_SHOWN:
+            lines.append(f"{name:<48}{probability:.3f}")
+    hidden = sum(value for value in structures.values() if value < _LEAST_SHOWN)
+    if hidden > 0:
+        lines.append(f"{'all others':<48}{hidden:.1g}")
+    for entry in report["structure"][:1]:
+        if entry["constraints"]:
+            lines += ["", "constraints of the most probable structure"]
+            lines += _constraint_lines(entry["constraints"])
+    if report["known_constraints"]:
+        lines += ["", "known constraints with inferred numbers"]
+        lines += _constraint_lines(report["known_constraints"])
+    lines += ["", "noise of one reading (sd)"]
+    for name, noise in report["noise"].items():
+        parts = [
+            f"{channel} {_plus_minus(noise[channel])} {unit}"
+            for channel, unit in _NOISE_UNITS.items()
+        ]
+        lines.append(f"  {name:<14}{', '.join(parts)}")
+    evidence = report["log_evidence"]
+    text = "not computed" if evidence is None else f"{evidence:.2f}"
+    lines += ["", f"log-evidence  {text} ({num_draws} draws)"]
+    diagnostics = report["diagnostics"]
+    reasons = "; ".join(diagnostics["reasons"])
+    lines.append(f"diagnostics   {'ok' if diagnostics['ok'] else 'NOT OK: ' + reasons}")
+    return "\n".join(lines)
+
+
+def _shift(spec: SceneSpec) -> np.ndarray:
+    return np.array([body.shift for body in spec.bodies]).reshape(-1, 2)
+
+
+def _moving_names(spec: SceneSpec) -> list[str]:
+    return [body.name for body in spec.bodies if not body.is_static]
+
+
+def _has_spread(entry: dict) -> bool:
+    """Whether any number of a constraint varies over the draws."""
+    spreads = [
+        np.ravel(item["sd"]) for item in entry.values() if isinstance(item, dict)
+    ]
+    return any(sd is not None and sd > 0 for each in spreads for sd in each)
+
+
+def _constraint_lines(constraints: list[dict]) -> list[str]:
+    """A heading per constraint and a line per quantity."""
+    lines = []
+    for entry in constraints:
+        ends = f"{entry['a']} – {entry['b']}" if "b" in entry else entry["a"]
+        lines.append(f"  {entry['type']} ({ends})")
+        for key, summary in entry.items():
+            if isinstance(summary, dict):
+                text = _quantity(summary, _units(entry["type"], key))
+                lines.append(f"    {_TITLES[key]:<20}{text}")
+    return lines
+
+
+def _units(kind: str, key: str) -> list[str]:
+    """Units of each number of a quantity."""
+    if key == "pose":
+        return ["m", "m", "rad"]
+    if key in ("viscous", "dry"):
+        return [_UNITS[kind][key]] * (2 if kind == "wheel" else 1)
+    return ["m", "m"] if key.startswith("anchor") else ["m"]
+
+
+def _quantity(summary: dict, units: list[str]) -> str:
+    """Every number as mean ± sd and unit, marked where it is only the prior's."""
+    columns = {
+        key: value if isinstance(value, list) else [value]
+        for key, value in summary.items()
+    }
+    parts = []
+    for place, unit in enumerate(units):
+        number = {key: value[place] for key, value in columns.items()}
+        if number["mean"] is None:
+            parts.append("unlimited")
+            continue
+        mark = "" if number["identified"] else " (prior)"
+        parts.append(f"{_plus_minus(number)} {unit}".rstrip() + mark)
+    return ", ".join(parts)
+
+
+def _plus_minus(number: dict) -> str:
+    if number["mean"] is None or number["sd"] is None:
+        return "unlimited"
+    if number["sd"] == 0:
+        return f"{number['mean']:.4g}"
+    digits = max(0, 1 - int(np.floor(np.log10(number["sd"]))))
+    digits = min(digits, 6)
+    return f"{number['mean']:.{digits}f} ± {number['sd']:.{digits}f}"
+
+
+def _interval(number: dict) -> str:
+    if None in (number["mean"], number["q05"], number["q95"]):
+        return "unknown"
+    if number["sd"] == 0:
+        return f"{number['mean']:.4g}"
+    return f"{number['mean']:.4g} ({number['q05']:.4g} to {number['q95']:.4g})"

@@ -1,0 +1,271 @@
+"""How well a posterior predicts held-out motion, several steps ahead.
+
+From every reading inside an episode, draws of the posterior are rolled out under the
+recorded wrenches. A prediction is uncertain for three reasons, and all are drawn: which
+hypothesis holds, where the bodies truly were when they were read at the start, and how
+the reading at the end will err.
+"""
+
+import functools
+import math
+from collections.abc import Iterable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from boomdp_jax.core.arrays import Key
+from boomdp_jax.core.history import History
+from boomdp_jax.inference.posterior import Posterior, add_reading_noise
+from boomdp_jax.inference.summary import CHANNELS, plain
+from boomdp_jax.physics import Params, Scene, rollout, state_from_array
+
+SCHEMA = "boomdp-predict-1"
+
+_COLUMNS = {"position": [0, 1], "angle": [2], "velocity": [3, 4], "spin": [5]}
+_STARTS_AT_ONCE = 16
+"""Starts rolled out together: enough to fill vectors, few enough to bound memory."""
+
+
+def predict(
+    posterior: Posterior,
+    history: History,
+    horizons: Iterable[int] = (1, 10, 50),
+    *,
+    num_draws: int = 128,
+    key: Key | None = None,
+) -> dict:
+    """Score predictions at several horizons.
+
+    A start is a row whose reading has every channel of every body that can move and
+    that is followed by enough rows of its episode. Readings at the end count channel by
+    channel. Angles are compared as they are, not modulo a turn, as files hold them
+    unwrapped.
+
+    Args:
+        posterior: what is believed.
+        history: readings and wrenches that it has not seen.
+        horizons: steps ahead.
+        num_draws: draws rolled out from each start.
+        key: random key; default: that of seed 0.
+
+    Returns:
+        A `boomdp-predict-1` object. By horizon and channel: `rmse` of the predictive
+        mean (of the distance, for position [m] and velocity [m/s]; of the angle [rad]
+        and spin [rad/s]), `coverage90` of central 90 % intervals, `log_score`: mean log
+        predictive density of a number, of the normal with the draws' mean and
+        variance, and `baseline_rmse` of constant velocity; None where nothing could
+        be scored. By horizon, `num_starts`: rows that were predicted from.
+
+    Raises:
+        ValueError: a horizon under one, too few draws, or another number of bodies.
+    """
+    horizons = sorted({int(horizon) for horizon in horizons})
+    if not horizons or horizons[0] < 1:
+        raise ValueError(f"horizons: expected steps of at least 1, got {horizons}")
+    if num_draws < 2:
+        raise ValueError(f"num_draws: expected at least 2, got {num_draws}")
+    num_bodies = len(posterior.spec.bodies)
+    if history.num_bodies != num_bodies:
+        raise ValueError(
+            f"history: expected {num_bodies} bodies as in the scene, got "
+            f"{history.num_bodies}"
+        )
+    key = jax.random.key(0) if key is None else key
+    kept = posterior.thin(num_draws)
+    scene = posterior.spec.scene
+    moments = _predict_rows(
+        key,
+        scene,
+        kept.params,
+        kept.noise_scale,
+        history,
+        tuple(horizons),
+    )
+    moments = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), moments)
+    table = jax.tree.map(np.asarray, history)
+    is_static = np.asarray(scene.is_static)
+    report = {}
+    for place, horizon in enumerate(horizons):
+        at_horizon = {name: leaf[:, place] for name, leaf in moments.items()}
+        at_horizon["baseline"] = constant_velocity(table, horizon)
+        with np.errstate(over="ignore", invalid="ignore"):
+            report[str(horizon)] = _score(at_horizon, table, horizon, is_static)
+    counts = {str(h): len(usable_starts(table, h, is_static)) for h in horizons}
+    return plain({"schema": SCHEMA, "horizons": report, "num_starts": counts})
+
+
+def sample_readings(
+    key: Key,
+    scene: Scene,
+    params: Params,
+    noise_scale: Float[Array, "draw body 4"],
+    reading: Float[Array, "draw body 6"],
+    wrenches: Float[Array, "draw time body 3"],
+    dt: Float[Array, "draw time"],
+    places: Int[Array, " place"],
+) -> Float[Array, "draw place body 6"]:
+    """Draw what may be read later, one trajectory for each hypothesis.
+
+    Args:
+        key: random key.
+        scene: outlines, feet, gravity.
+        params: hypotheses with a leading draw axis.
+        noise_scale: of each hypothesis [m, rad, m/s, rad/s].
+        reading: what is read at the start; the truth scatters around it.
+        wrenches: held over each step [N, N, N m].
+        dt: lengths of the steps [s].
+        places: after which steps to read, counted from 0.
+
+    Returns:
+        Readings at those places.
+    """
+    start_key, end_key = jax.random.split(key)
+    start = add_reading_noise(
+        start_key, state_from_array(reading), noise_scale, scene.is_static
+    )
+
+    def advance(params, state, wrenches, dt):
+        states, _ = rollout(scene, params, state, wrenches, dt=dt)
+        return jax.tree.map(lambda leaf: leaf[places], states)
+
+    states = jax.vmap(advance)(params, start, wrenches, dt)
+    return add_reading_noise(
+        end_key, states, noise_scale[:, None], scene.is_static
+    ).array
+
+
+@functools.partial(jax.jit, static_argnames=("horizons",))
+def _predict_rows(
+    key: Key,
+    scene: Scene,
+    params: Params,
+    noise_scale: Float[Array, "draw body 4"],
+    history: History,
+    horizons: tuple[int, ...],
+) -> dict[str, Float[Array, "time horizon body 6"]]:
+    """Moments and interval of the predictive distribution from every row.
+
+    Rows that no episode follows long enough are computed too, from whatever comes
+    next, and masked when scored: one shape serves every history of a capacity. Starts
+    and draws share one axis: two nested ones took ten times as long to compile.
+    """
+    num_draws, num_rows = noise_scale.shape[0], history.capacity
+    num_starts = min(_STARTS_AT_ONCE, num_rows)
+    num_blocks = -(-num_rows // num_starts)
+    last = num_rows - 1
+    rows = jnp.minimum(jnp.arange(num_blocks * num_starts), last)
+    places = jnp.array(horizons) - 1
+    draw = jnp.tile(jnp.arange(num_draws), num_starts)
+
+    def predict_block(inputs):
+        block_key, starts = inputs
+        row = jnp.repeat(starts, num_draws)
+        following = jnp.minimum(row[:, None] + jnp.arange(horizons[-1])[None], last)
+        readings = sample_readings(
+            block_key,
+            scene,
+            jax.tree.map(lambda leaf: leaf[draw], params),
+            noise_scale[draw],
+            history.state[row],
+            history.action[following],
+            history.dt[following],
+            places,
+        ).reshape(num_starts, num_draws, *places.shape, -1, 6)
+        low, high = jnp.quantile(readings, jnp.array([0.05, 0.95]), axis=1)
+        return {
+            "mean": readings.mean(axis=1),
+            "variance": readings.var(axis=1, ddof=1),
+            "low": low,
+            "high": high,
+        }
+
+    blocks = rows.reshape(num_blocks, num_starts)
+    keys = jax.random.split(key, num_blocks)
+    moments = jax.lax.map(predict_block, (keys, blocks))
+    return jax.tree.map(
+        lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:num_rows], moments
+    )
+
+
+def constant_velocity(
+    history: History, horizon: int
+) -> Float[np.ndarray, "time body 6"]:
+    """Predict from every row that bodies go on as they were read.
+
+    Args:
+        history: the table.
+        horizon: steps ahead.
+
+    Returns:
+        Readings after so many steps; past the end of the table, whatever.
+    """
+    state = np.asarray(history.state, np.float64)
+    time = np.concatenate([[0.0], np.cumsum(np.asarray(history.dt, np.float64))])
+    rows = np.arange(len(state))
+    elapsed = time[np.minimum(rows + horizon, len(state))] - time[rows]
+    pose = state[..., :3] + elapsed[:, None, None] * state[..., 3:]
+    return np.concatenate([pose, state[..., 3:]], axis=-1)
+
+
+def usable_starts(
+    history: History, horizon: int, is_static: Bool[np.ndarray, " body"]
+) -> Int[np.ndarray, " start"]:
+    """Rows with a complete reading and enough rows of their episode to follow.
+
+    Args:
+        history: the table.
+        horizon: rows needed, the start's own included.
+        is_static: bodies whose readings do not matter.
+
+    Returns:
+        Indices of rows, ascending.
+    """
+    mask, episode = np.asarray(history.mask), np.asarray(history.episode)
+    num_starts = len(mask) - horizon + 1
+    if num_starts < 1:
+        return np.zeros(0, int)
+    is_whole = np.all(np.asarray(history.state_mask)[:, ~is_static], axis=(1, 2))
+    is_usable = np.array(is_whole[:num_starts])
+    for offset in range(horizon):
+        end = offset + num_starts
+        is_usable &= mask[offset:end] & (episode[offset:end] == episode[:num_starts])
+    return np.flatnonzero(is_usable)
+
+
+def _score(
+    moments: dict[str, np.ndarray],
+    history: History,
+    horizon: int,
+    is_static: np.ndarray,
+) -> dict:
+    """Compare predictions with what was read at one horizon."""
+    starts = usable_starts(history, horizon, is_static)
+    ends = starts + horizon - 1
+    moving = ~is_static
+    reading = history.next_state[ends][:, moving].astype(np.float64)
+    is_read = history.next_state_mask[ends][:, moving]
+    chosen = {name: leaf[starts][:, moving] for name, leaf in moments.items()}
+    report: dict = {}
+    for channel in CHANNELS:
+        columns = _COLUMNS[channel]
+        there = is_read[..., columns]
+        if not there.any():
+            report[channel] = dict.fromkeys(
+                ("rmse", "coverage90", "log_score", "baseline_rmse")
+            )
+            continue
+        value = reading[..., columns][there]
+        part = {name: leaf[..., columns][there] for name, leaf in chosen.items()}
+        error, drift = value - part["mean"], value - part["baseline"]
+        variance = np.maximum(part["variance"], np.finfo(np.float32).tiny)
+        inside = (part["low"] <= value) & (value <= part["high"])
+        density = -0.5 * (error**2 / variance + np.log(2.0 * math.pi * variance))
+        report[channel] = {
+            "rmse": math.sqrt(len(columns) * np.mean(error**2)),
+            "coverage90": float(np.mean(inside)),
+            "log_score": float(np.mean(density)),
+            "baseline_rmse": math.sqrt(len(columns) * np.mean(drift**2)),
+        }
+    return report

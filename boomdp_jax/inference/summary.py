@@ -1,0 +1,166 @@
+"""From weighted draws to numbers for people: mean, sd, quantiles, and what is known.
+
+A quantity is *identified* where its posterior variance is under half of its prior
+variance on the scale that it is sampled on; where it is not, the prior's interval is
+what can honestly be said, so that is what is reported.
+"""
+
+import math
+from typing import Any, Literal
+
+import numpy as np
+
+Scale = Literal["identity", "log", "axial"]
+"""Scale on which spread is judged; `axial`: an angle that is the same modulo pi."""
+
+CHANNELS = ("position", "angle", "velocity", "spin")
+"""Groups of readings that share a noise scale, in the order of the last axis."""
+
+_FEWEST_DRAWS = 5.0
+"""Effective draws below which a variance is not worth comparing with the prior's."""
+
+
+def weighted_quantiles(
+    draws: np.ndarray, weights: np.ndarray, levels: tuple[float, ...]
+) -> np.ndarray:
+    """Quantiles of weighted draws, interpolated between the middles of the steps.
+
+    With equal weights this is Hazen's rule, `numpy.quantile(..., method="hazen")`.
+
+    Args:
+        draws: values, `[draw, number]`.
+        weights: non-negative, sum to one, `[draw]`.
+        levels: in [0, 1].
+
+    Returns:
+        Quantiles, `[level, number]`.
+    """
+    order = np.argsort(draws, axis=0, kind="stable")
+    result = np.empty((len(levels), draws.shape[1]))
+    for column in range(draws.shape[1]):
+        weight = weights[order[:, column]]
+        middle = np.cumsum(weight) - 0.5 * weight
+        result[:, column] = np.interp(levels, middle, draws[order[:, column], column])
+    return result
+
+
+def axial_mean(angle: np.ndarray, weights: np.ndarray) -> float:
+    """Mean of angles that are the same modulo pi [rad], in (-pi/2, pi/2]."""
+    sine, cosine = weights @ np.sin(2.0 * angle), weights @ np.cos(2.0 * angle)
+    return 0.5 * math.atan2(sine, cosine)
+
+
+def axial_difference(angle: np.ndarray, centre: float) -> np.ndarray:
+    """Difference of angles modulo pi [rad], in [-pi/2, pi/2)."""
+    return np.mod(angle - centre + 0.5 * np.pi, np.pi) - 0.5 * np.pi
+
+
+def summarise(
+    draws: np.ndarray,
+    weights: np.ndarray,
+    prior: np.ndarray | None,
+    scale: Scale | tuple[Scale, ...] = "identity",
+) -> dict:
+    """Summarise one quantity, number by number.
+
+    Args:
+        draws: posterior draws, `[draw]` or `[draw, number]`.
+        weights: of the draws, sum to one, `[draw]`.
+        prior: equally weighted prior draws of the same quantity; None: there are none,
+            then nothing counts as identified and the interval is the posterior's.
+        scale: on which spread is judged, one for all numbers or one for each.
+
+    Returns:
+        `mean`, `sd`, `q05`, `q50`, `q95`, `identified`, each a plain number (a list of
+        them for a vector), with None in place of what is not finite. A number whose
+        prior does not vary was given, and counts as identified.
+    """
+    is_vector = draws.ndim == 2
+    table = np.asarray(draws, np.float64).reshape(len(draws), -1)
+    scales = (scale,) * table.shape[1] if isinstance(scale, str) else scale
+    columns = []
+    for number, one_scale in enumerate(scales):
+        value = table[:, number]
+        if prior is None:
+            columns.append(
+                {**_statistics(value, weights, one_scale), "identified": False}
+            )
+            continue
+        reference = np.asarray(prior, np.float64).reshape(len(prior), -1)[:, number]
+        equal = np.full(len(reference), 1.0 / len(reference))
+        if np.all(reference == reference[0]):
+            columns.append(
+                {**_statistics(value, weights, one_scale), "identified": True}
+            )
+        elif _is_identified(value, weights, reference, equal, one_scale):
+            columns.append(
+                {**_statistics(value, weights, one_scale), "identified": True}
+            )
+        else:
+            columns.append(
+                {**_statistics(reference, equal, one_scale), "identified": False}
+            )
+    if not is_vector:
+        return plain(columns[0])
+    return plain({key: [column[key] for column in columns] for key in columns[0]})
+
+
+def plain(value: Any) -> Any:
+    """Turn arrays and numbers into what JSON knows; what is not finite becomes None."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return plain(np.asarray(value).tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    return str(value)
+
+
+def _statistics(value: np.ndarray, weights: np.ndarray, scale: Scale) -> dict:
+    """Mean, sd and quantiles of one number; an axial one is unrolled at its mean."""
+    if np.all(value == value[0]):
+        names = ("mean", "q05", "q50", "q95")
+        sd = 0.0 if np.isfinite(value[0]) else np.nan
+        return {**dict.fromkeys(names, float(value[0])), "sd": sd}
+    centre = axial_mean(value, weights) if scale == "axial" else 0.0
+    if scale == "axial":
+        value = axial_difference(value, centre)
+    with np.errstate(invalid="ignore"):
+        mean = weights @ value
+        sd = np.sqrt(weights @ (value - mean) ** 2)
+    levels = weighted_quantiles(value[:, None], weights, (0.05, 0.5, 0.95))[:, 0]
+    return {
+        "mean": float(centre + mean),
+        "sd": float(sd),
+        "q05": float(centre + levels[0]),
+        "q50": float(centre + levels[1]),
+        "q95": float(centre + levels[2]),
+    }
+
+
+def _is_identified(
+    value: np.ndarray,
+    weights: np.ndarray,
+    prior: np.ndarray,
+    prior_weights: np.ndarray,
+    scale: Scale,
+) -> bool:
+    """Whether the posterior variance is under half of the prior's."""
+    if 1.0 / np.sum(weights**2) < _FEWEST_DRAWS:
+        return False
+    spread = _variance(value, weights, scale)
+    return bool(spread < 0.5 * _variance(prior, prior_weights, scale))
+
+
+def _variance(value: np.ndarray, weights: np.ndarray, scale: Scale) -> float:
+    """Variance on a scale; NaN where a value is infinite."""
+    if scale == "axial":
+        value = axial_difference(value, axial_mean(value, weights))
+    elif scale == "log":
+        value = np.log(np.maximum(value, np.finfo(np.float32).tiny))
+    with np.errstate(invalid="ignore"):
+        return float(weights @ (value - weights @ value) ** 2)

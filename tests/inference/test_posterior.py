@@ -1,0 +1,178 @@
+"""The posterior container: reports, thinning, sampling, the generative transition."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from boomdp_jax.inference.posterior import Posterior, add_reading_noise
+from boomdp_jax.physics import State, empty_params
+from tests.inference.posteriors import (
+    draws_like,
+    make_posterior,
+    room_spec,
+    table_posterior,
+    table_prior,
+    table_spec,
+)
+
+SUMMARY = {"mean", "sd", "q05", "q50", "q95", "identified"}
+
+
+def free_posterior(density, **fields) -> Posterior:
+    """A box without any constraint slot."""
+    density = np.asarray(density, float)[:, None]
+    params = draws_like(empty_params(1), len(density), density=jnp.asarray(density))
+    return make_posterior(table_spec(), params, params, **fields)
+
+
+def test_the_report_has_every_field_of_its_schema():
+    report = table_posterior(80).to_json()
+    assert report["schema"] == "boomdp-infer-1"
+    assert set(report) >= {
+        "bodies",
+        "structure",
+        "noise",
+        "log_evidence",
+        "diagnostics",
+        "seconds",
+    }
+    assert report["log_evidence"] == 12.5
+    assert report["seconds"] == {"compile": 1.0, "run": 0.5}
+    assert report["diagnostics"]["ok"] is True
+    assert set(report["bodies"]["table"]["mass"]) == SUMMARY
+    assert set(report["noise"]["table"]) == {"position", "angle", "velocity", "spin"}
+    for constraint in report["structure"][1]["constraints"]:
+        for value in constraint.values():
+            assert isinstance(value, str) or set(value) == SUMMARY
+
+
+def test_the_report_is_json_without_nan(precision):
+    posterior = table_posterior(80, log_evidence=float("nan"))
+    text = json.dumps(posterior.to_json(), allow_nan=False)
+    assert json.loads(text)["log_evidence"] is None
+    assert posterior.params.density.dtype == jnp.dtype(f"float{precision.bits}")
+
+
+def test_mass_is_density_times_area():
+    posterior = table_posterior(400)
+    body = posterior.to_json()["bodies"]["table"]
+    mass = np.asarray(posterior.params.density)[:, 0] * 0.6 * 0.4
+    assert body["identified"] is True
+    assert body["mass"]["mean"] == pytest.approx(mass.mean())
+    assert body["mass"]["sd"] == pytest.approx(mass.std())
+    assert body["mass"]["q05"] == pytest.approx(np.quantile(mass, 0.05, method="hazen"))
+
+
+def test_a_mass_that_was_not_learnt_is_the_priors():
+    prior = table_prior()
+    posterior = make_posterior(table_spec(), prior, prior)
+    body = posterior.to_json()["bodies"]["table"]
+    assert body["identified"] is False
+    mass = np.asarray(prior.density)[:, 0] * 0.6 * 0.4
+    assert body["mass"]["q95"] == pytest.approx(np.quantile(mass, 0.95, method="hazen"))
+
+
+def test_a_density_in_the_scene_file_is_known():
+    params = draws_like(empty_params(1, density=20.0), 50)
+    posterior = make_posterior(table_spec(density=20.0), params, params)
+    body = posterior.to_json()["bodies"]["table"]
+    assert body["identified"] is True
+    assert body["density"]["mean"] == pytest.approx(20.0)
+
+
+def test_static_bodies_are_left_out():
+    params = draws_like(empty_params(3, num_revolute=2, num_wheel=2), 20)
+    report = make_posterior(room_spec(), params, params).to_json()
+    assert list(report["bodies"]) == ["table", "chair"]
+    assert list(report["noise"]) == ["table", "chair"]
+
+
+def test_the_table_names_structures_and_failures():
+    posterior = table_posterior(
+        80, diagnostics={"ok": False, "reasons": ["R-hat 1.3", "one chain is stuck"]}
+    )
+    text = posterior.summary()
+    assert "pin + wheel" in text
+    assert "0.750" in text
+    assert "N m s/rad" in text
+    assert "NOT OK: R-hat 1.3; one chain is stuck" in text
+    assert "12.50" in text
+
+
+def test_thinning_keeps_shares_by_weight():
+    # Every fourth draw has the wheel: a rule with a period would keep all or none.
+    weights = np.where(np.arange(4000) % 4 == 0, 9.0, 1.0)
+    thin = table_posterior(4000, weights=weights).thin(1000)
+    assert thin.num_draws == 1000
+    np.testing.assert_allclose(thin.weights, 0.001)
+    share = thin.structure_probabilities()["pin + wheel"]
+    # Five standard errors of independent draws; strata only lower it.
+    assert share == pytest.approx(0.75, abs=5 * (0.75 * 0.25 / 1000) ** 0.5)
+
+
+def test_thinning_to_more_draws_changes_nothing():
+    posterior = table_posterior(40)
+    assert posterior.thin(1000) is posterior
+    with pytest.raises(ValueError, match="num_draws: expected at least 1, got 0"):
+        posterior.thin(0)
+
+
+def test_sampled_params_follow_the_weights():
+    weights = np.where(np.arange(400) % 4 == 0, 9.0, 1.0)
+    posterior = table_posterior(400, weights=weights)
+    params = posterior.sample_params(jax.random.key(0), 4000)
+    share = float(params.wheel.active.mean())
+    # Five standard errors of a share of 3/4.
+    assert share == pytest.approx(0.75, abs=5 * (0.75 * 0.25 / 4000) ** 0.5)
+
+
+def test_a_transition_is_a_step_of_a_draw_plus_noise():
+    noise = np.array([0.001, 0.002, 0.005, 0.01])
+    mass = np.array([10.0, 20.0, 40.0]) * 0.24
+    posterior = free_posterior([10.0, 20.0, 40.0], noise_scale=tuple(noise))
+    state = State(
+        pose=jnp.array([[0.5, -0.2, 1.0]]), twist=jnp.array([[0.3, 0.0, 2.0]])
+    )
+    force = 12.0
+    wrench = jnp.array([[0.0, force, 0.0]])
+    keys = jax.random.split(jax.random.key(1), 3000)
+    draw = jax.jit(jax.vmap(lambda key: posterior.transition(key, state, wrench)))
+    readings = np.asarray(draw(keys).array)[:, 0]
+    dt = 0.02
+    gain = force / mass * dt
+    # Mean and variance over the three masses and the noise, in closed form.
+    mean = [
+        0.5 + 0.3 * dt,
+        -0.2 + 0.5 * dt * gain.mean(),
+        1 + 2 * dt,
+        0.3,
+        gain.mean(),
+        2,
+    ]
+    variance = np.array([0, (0.5 * dt) ** 2 * gain.var(), 0, 0, gain.var(), 0])
+    variance = variance + noise[[0, 0, 1, 2, 2, 3]] ** 2
+    error = np.abs(readings.mean(axis=0) - mean) / np.sqrt(variance / len(keys))
+    assert error.max() < 5.0
+    np.testing.assert_allclose(readings.var(axis=0), variance, rtol=0.15)
+
+
+def test_readings_of_static_bodies_have_no_noise():
+    spec = room_spec()
+    state = spec.initial_state()
+    after = add_reading_noise(
+        jax.random.key(0), state, jnp.full((3, 4), 0.01), spec.scene.is_static
+    )
+    np.testing.assert_array_equal(after.array[0], state.array[0])
+    assert np.all(np.asarray(after.array[1:]) != np.asarray(state.array[1:]))
+
+
+def test_a_posterior_passes_through_jit():
+    posterior = table_posterior(40)
+    total = jax.jit(lambda given: given.params.density.sum() + given.log_evidence)
+    expected = float(np.asarray(posterior.params.density).sum()) + 12.5
+    assert float(total(posterior)) == pytest.approx(expected)
+    assert float(total(posterior)) == pytest.approx(expected)
+    assert total._cache_size() == 1
