@@ -1,0 +1,1 @@
+"""The command line: `infer`, `predict` and `simulate`, thin around the library."""

@@ -1,0 +1,144 @@
+"""The command line: reads arguments, calls the library, answers bad input with 2."""
+
+import argparse
+import importlib
+import math
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from typing import NoReturn, TextIO
+
+METHODS = ("auto", "rj", "nuts")
+"""Ways to infer that exist."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Args:
+        argv: arguments after the program's name; default: those of the process.
+
+    Returns:
+        Exit status: 0, or 2 for bad input, then with one line on standard error.
+    """
+    try:
+        arguments = _make_parser().parse_args(argv)
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else 2
+    command = importlib.import_module(f"boomdp_jax.cli.{arguments.command}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        warnings.showwarning = _show_warning  # ty: ignore[invalid-assignment]
+        try:
+            command.run(arguments)
+        except OSError as error:
+            message = error.strerror or str(error)
+            _complain(f"{error.filename}: {message}" if error.filename else message)
+            return 2
+        except ValueError as error:
+            _complain(str(error))
+            return 2
+    return 0
+
+
+class _OneLineParser(argparse.ArgumentParser):
+    """A parser whose complaint is one line; argparse offers no other way to say so."""
+
+    def error(self, message: str) -> NoReturn:
+        _complain(message)
+        self.exit(2)
+
+
+def _make_parser() -> argparse.ArgumentParser:
+    parser = _OneLineParser(
+        prog="boomdp_jax", description="Learn what a pushed object is, and use it."
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    _add_infer(commands.add_parser("infer", help="from recordings to a posterior"))
+    _add_predict(commands.add_parser("predict", help="held-out error and coverage"))
+    _add_simulate(commands.add_parser("simulate", help="from wrenches to a recording"))
+    return parser
+
+
+def _add_infer(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("data", nargs="+", metavar="DATA.npz", help="planar-transitions-1")
+    add("--scene", required=True, metavar="SCENE.json", help="planar-scene-1")
+    add("--rows", type=_whole(1), metavar="N", help="use the first N rows")
+    add("--method", choices=METHODS, default="auto")
+    add("--seed", type=_whole(0, 2**32 - 1), default=0)
+    add(
+        "--out",
+        metavar="POST.npz",
+        help="write the posterior; of several data files, to POST-0.npz, POST-1.npz...",
+    )
+    add("--json", action="store_true", help="one JSON object a data file, a line each")
+    add("--plot", metavar="FIG.png", help="draw the posterior; numbered like --out")
+
+
+def _add_predict(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("posterior", metavar="POST.npz", help="what infer --out wrote")
+    add("data", metavar="DATA.npz", help="planar-transitions-1")
+    add("--horizon", nargs="+", type=_whole(1), default=[1, 10, 50], metavar="STEPS")
+    add("--json", action="store_true", help="one JSON object on standard output")
+
+
+def _add_simulate(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("scene", metavar="SCENE.json", help="planar-scene-1")
+    add("--actions", required=True, metavar="A.npz", help="wrenches to apply")
+    add("--out", required=True, metavar="DATA.npz", help="planar-transitions-1")
+    add("--posterior", metavar="POST.npz", help="take the parameters from a draw")
+    add("--draw", type=_whole(0), metavar="K", help="which draw, from 0")
+    add(
+        "--noise",
+        nargs=4,
+        type=_scale,
+        metavar=("SX", "STHETA", "SV", "SOMEGA"),
+        help="standard deviation of readings [m, rad, m/s, rad/s]",
+    )
+    add("--seed", type=_whole(0, 2**32 - 1), default=0)
+
+
+def _whole(least: int, most: int | None = None) -> Callable[[str], int]:
+    """A reader of whole numbers within bounds."""
+
+    def read(text: str) -> int:
+        bounds = f"at least {least}" if most is None else f"{least} to {most}"
+        wrong = f"expected a whole number, {bounds}, got {text!r}"
+        try:
+            number = int(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(wrong) from error
+        if number < least or (most is not None and number > most):
+            raise argparse.ArgumentTypeError(wrong)
+        return number
+
+    return read
+
+
+def _scale(text: str) -> float:
+    wrong = f"expected a finite number of at least 0, got {text!r}"
+    try:
+        number = float(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(wrong) from error
+    if not math.isfinite(number) or number < 0:
+        raise argparse.ArgumentTypeError(wrong)
+    return number
+
+
+def _complain(message: str) -> None:
+    print("boomdp_jax: error:", " ".join(message.split()), file=sys.stderr)
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    print("boomdp_jax: warning:", " ".join(str(message).split()), file=sys.stderr)

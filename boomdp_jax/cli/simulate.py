@@ -1,0 +1,186 @@
+"""`simulate`: from a scene and wrenches to a recording, noisy if asked."""
+
+import argparse
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from boomdp_jax.cli.output import check_writable, print_notes, versions
+from boomdp_jax.core.action_file import ActionTable, load_actions
+from boomdp_jax.core.arrays import Key
+from boomdp_jax.core.history_file import save_transitions
+from boomdp_jax.physics.params import Params
+from boomdp_jax.physics.scene import Scene
+from boomdp_jax.physics.scene_file import load_scene
+from boomdp_jax.physics.scene_spec import SceneSpec
+from boomdp_jax.physics.state import State, state_from_array
+
+_NUM_CHANNELS = np.array([2, 1, 2, 1])
+"""Channels of a state that share a noise scale: position, angle, velocity, spin."""
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Simulate in 64 bit, which is what data files hold, and write the recording.
+
+    Args:
+        arguments: what `cli.main` parsed.
+
+    Raises:
+        ValueError: bad input; nothing has been written then.
+    """
+    check_writable(arguments.out)
+    if arguments.draw is not None and arguments.posterior is None:
+        raise ValueError("--draw: expected --posterior beside it, got none")
+    with jax.enable_x64(True):
+        spec = load_scene(arguments.scene)
+        print_notes(spec.notes)
+        actions = load_actions(arguments.actions, spec)
+        params = _load_params(arguments, spec)
+        if actions.initial_state is None:
+            initial_state = spec.initial_state()
+        else:
+            initial_state = state_from_array(jnp.asarray(actions.initial_state))
+        before, after = simulate(spec.scene, params, initial_state, actions)
+        _check_finite(after, spec, actions)
+        if arguments.noise is not None:
+            key = jax.random.key(arguments.seed)
+            moves = ~spec.is_static
+            before, after = read_with_noise(
+                key, before, after, actions.is_start, arguments.noise, moves
+            )
+    origin = {
+        "scene": spec.to_dict(),
+        "posterior": arguments.posterior,
+        "draw": arguments.draw,
+        "noise": arguments.noise,
+        "seed": arguments.seed,
+        "versions": versions(),
+    }
+    save_transitions(
+        arguments.out,
+        state=before,
+        action=actions.action,
+        next_state=after,
+        dt=actions.dt,
+        episode=actions.episode,
+        point=actions.point,
+        params=json.dumps(origin),
+    )
+
+
+def simulate(
+    scene: Scene, params: Params, initial_state: State, actions: ActionTable
+) -> tuple[Float[np.ndarray, "time body 6"], Float[np.ndarray, "time body 6"]]:
+    """Apply wrenches row by row; each episode starts from the initial state.
+
+    A force that acts at a point acts there as the body stands when the step begins.
+
+    Args:
+        scene: the scene.
+        params: what is true of it.
+        initial_state: where each episode starts.
+        actions: what to apply.
+
+    Returns:
+        States before and after each row.
+    """
+    from boomdp_jax.physics import step
+
+    def advance(state, row):
+        action, point, dt, is_start = row
+        state = jax.tree.map(
+            lambda now, start: jnp.where(is_start, start, now), state, initial_state
+        )
+        wrench = action if point is None else _wrench_at_centre(action, point, state)
+        next_state, _ = step(scene, params, state, wrench, dt=dt)
+        return next_state, (state.array, next_state.array)
+
+    rows = (actions.action, actions.point, actions.dt, actions.is_start)
+    rows = jax.tree.map(jnp.asarray, rows)
+    run_rows = jax.jit(lambda rows: jax.lax.scan(advance, initial_state, rows)[1])
+    before, after = run_rows(rows)
+    return np.asarray(before), np.asarray(after)
+
+
+def read_with_noise(
+    key: Key,
+    before: Float[np.ndarray, "time body 6"],
+    after: Float[np.ndarray, "time body 6"],
+    is_start: np.ndarray,
+    scales: list[float],
+    moves: np.ndarray,
+) -> tuple[Float[np.ndarray, "time body 6"], Float[np.ndarray, "time body 6"]]:
+    """Take one noisy reading of each instant.
+
+    What is read after a row is, to the bit, what is read before the next one of its
+    episode.
+
+    Args:
+        key: randomness.
+        before: true states before each row.
+        after: true states after each row.
+        is_start: which rows begin an episode.
+        scales: standard deviation of position [m], angle [rad], velocity [m/s] and
+            spin [rad/s].
+        moves: which bodies are read with noise.
+
+    Returns:
+        Readings before and after each row.
+    """
+    scale = np.repeat(scales, _NUM_CHANNELS) * moves[:, None]
+    start_key, after_key = jax.random.split(key)
+    start_noise = np.asarray(jax.random.normal(start_key, before.shape))
+    after_noise = np.asarray(jax.random.normal(after_key, after.shape))
+    readings_after = after + scale * after_noise
+    readings_before = np.where(
+        is_start[:, None, None],
+        before + scale * start_noise,
+        np.roll(readings_after, 1, axis=0),
+    )
+    return readings_before, readings_after
+
+
+def _wrench_at_centre(
+    action: Float[Array, "body 3"], point: Float[Array, "body 2"], state: State
+) -> Float[Array, "body 3"]:
+    """Turn a force at a world point into a wrench; a body without force needs none."""
+    is_pushed = jnp.any(action[:, :2] != 0, axis=-1)
+    arm = jnp.where(is_pushed[:, None], point - state.pose[:, :2], 0.0)
+    torque = arm[:, 0] * action[:, 1] - arm[:, 1] * action[:, 0]
+    return action.at[:, 2].add(torque)
+
+
+def _load_params(arguments: argparse.Namespace, spec: SceneSpec) -> Params:
+    """From the scene file, or from a draw of a posterior over the same bodies."""
+    if arguments.posterior is None:
+        if any(spec.unknown.values()):
+            print_notes([f"{spec.source}: unknown constraints are taken to be absent"])
+        return spec.params()
+    from boomdp_jax.inference.posterior import load_posterior
+
+    posterior = load_posterior(arguments.posterior)
+    if posterior.spec.names != spec.names:
+        raise ValueError(
+            f"{arguments.posterior}: expected bodies {', '.join(spec.names)[:200]}, as "
+            f"in {spec.source}, got {', '.join(posterior.spec.names)[:200]}"
+        )
+    draw, num_draws = arguments.draw or 0, posterior.params.density.shape[0]
+    if draw >= num_draws:
+        raise ValueError(
+            f"{arguments.posterior}: --draw: expected less than {num_draws}, got {draw}"
+        )
+    return jax.tree.map(lambda leaf: leaf[draw], posterior.params)
+
+
+def _check_finite(
+    after: Float[np.ndarray, "time body 6"], spec: SceneSpec, actions: ActionTable
+) -> None:
+    if not np.all(np.isfinite(after)):
+        row, body, _ = np.argwhere(~np.isfinite(after))[0]
+        raise ValueError(
+            f"{actions.source}: body {spec.names[body]!r}: expected a motion that "
+            f"stays finite, got one that does not from row {row}"
+        )

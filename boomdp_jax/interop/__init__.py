@@ -1,0 +1,27 @@
+"""Bridges to other software; each loads it at first use."""
+
+from boomdp_jax.interop.arviz import to_arviz as to_arviz
+from boomdp_jax.interop.mjcf import RecordingLaws as RecordingLaws
+from boomdp_jax.interop.object_families import FAMILIES as FAMILIES
+from boomdp_jax.interop.object_families import hide as hide
+from boomdp_jax.interop.object_families import random_object as random_object
+from boomdp_jax.interop.object_families import random_pushes as random_pushes
+from boomdp_jax.interop.object_families import (
+    record_random_pushes as record_random_pushes,
+)
+from boomdp_jax.interop.recording import READING_NOISE as READING_NOISE
+from boomdp_jax.interop.recording import record as record
+from boomdp_jax.interop.recording import with_reading_noise as with_reading_noise
+
+__all__ = [
+    "FAMILIES",
+    "READING_NOISE",
+    "RecordingLaws",
+    "hide",
+    "random_object",
+    "random_pushes",
+    "record",
+    "record_random_pushes",
+    "to_arviz",
+    "with_reading_noise",
+]

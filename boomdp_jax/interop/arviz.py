@@ -1,0 +1,136 @@
+"""A posterior as ArviZ sees it, with dimensions named by body, joint and wheel."""
+
+import importlib
+import warnings
+from typing import Any
+
+import jax
+import numpy as np
+
+from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.summary import CHANNELS
+
+_SUFFIX_DIMS = {
+    "anchor_a": ("axis",),
+    "anchor_b": ("axis",),
+    "position": ("axis",),
+    "load_shift": ("axis",),
+    "wheel_viscous": ("direction",),
+    "wheel_dry": ("direction",),
+}
+
+
+def to_arviz(posterior: Posterior) -> Any:
+    """Convert a posterior to `arviz.InferenceData`, or a `DataTree` in ArviZ 1.
+
+    Chains become a dimension where they are equally long and draws equally weighted;
+    otherwise the draws are resampled to equal weights and form one chain. Numbers of a
+    constraint that a draw does not have are NaN.
+
+    Args:
+        posterior: what is known.
+
+    Returns:
+        Groups `posterior` (numbers of Φ, mass, noise), `sample_stats` (log-density,
+        chain of origin) and `prior`.
+
+    Raises:
+        ImportError: ArviZ is not installed.
+    """
+    try:
+        with warnings.catch_warnings():
+            # ArviZ 0.23 announces its next version once a day when it is imported.
+            warnings.simplefilter("ignore", FutureWarning)
+            arviz: Any = importlib.import_module("arviz")
+    except ImportError as error:
+        raise ImportError(
+            "ArviZ is not installed; pip install 'boomdp_jax[arviz]'"
+        ) from error
+    kept = posterior.thin(posterior.num_draws)
+    num_chains = _num_chains(np.asarray(kept.chain))
+    if kept is not posterior:
+        num_chains = 1
+
+    def split(array: np.ndarray) -> np.ndarray:
+        return array.reshape(num_chains, -1, *array.shape[1:])
+
+    numbers, dims = _variables(posterior, kept.params, kept.noise_scale)
+    prior, _ = _variables(posterior, kept.prior_params, kept.prior_noise_scale)
+    groups = {
+        "posterior": {name: split(array) for name, array in numbers.items()},
+        "sample_stats": {
+            "lp": split(np.asarray(kept.log_density)),
+            "chain_of_origin": split(np.asarray(kept.chain)),
+        },
+        "prior": {name: array[None] for name, array in prior.items()},
+    }
+    coords = _coordinates(posterior)
+    major = int(arviz.__version__.split(".")[0])
+    if major >= 1:
+        return arviz.from_dict(groups, coords=coords, dims=dims)
+    return arviz.from_dict(**groups, coords=coords, dims=dims)
+
+
+def _num_chains(chain: np.ndarray) -> int:
+    """Chains that lie one after the other and are equally long; else one."""
+    names, counts = np.unique(chain, return_counts=True)
+    ordered = np.repeat(names, counts[0])
+    if np.ptp(counts) == 0 and np.array_equal(chain, ordered):
+        return len(names)
+    return 1
+
+
+def _variables(
+    posterior: Posterior, params: object, noise_scale: object
+) -> tuple[dict[str, np.ndarray], dict[str, list[str]]]:
+    """Arrays by name, leading axis draw, and the names of their other axes."""
+    params = jax.tree.map(np.asarray, params)
+    area = np.array([body.area for body in posterior.spec.bodies])
+    numbers = {
+        "density": params.density,
+        "mass": params.density * area,
+        "noise_scale": np.asarray(noise_scale),
+    }
+    dims = {
+        "density": ["body"],
+        "mass": ["body"],
+        "noise_scale": ["body", "channel"],
+    }
+    slot_dims = {
+        "revolute": ["revolute"],
+        "distance": ["distance"],
+        "wheel": ["body", "wheel"],
+        "ground": ["body", "ground"],
+    }
+    for kind, axes in slot_dims.items():
+        group = getattr(params, kind)
+        if group.active.shape[-1] == 0:
+            continue
+        for field, array in vars(group).items():
+            if array is None:
+                continue
+            name = f"{kind}_{field}"
+            extra = _SUFFIX_DIMS.get(name, _SUFFIX_DIMS.get(field, ()))
+            dims[name] = [*axes, *extra]
+            numbers[name] = array
+            if array.dtype.kind == "f":
+                active = group.active.reshape(
+                    *group.active.shape, *[1] * (array.ndim - group.active.ndim)
+                )
+                numbers[name] = np.where(active, array, np.nan)
+    return numbers, dims
+
+
+def _coordinates(posterior: Posterior) -> dict[str, list]:
+    """Names along each axis."""
+    params = posterior.params
+    return {
+        "body": list(posterior.spec.names),
+        "channel": list(CHANNELS),
+        "axis": ["x", "y"],
+        "direction": ["rolling", "lateral"],
+        "revolute": list(range(params.revolute.active.shape[-1])),
+        "distance": list(range(params.distance.active.shape[-1])),
+        "wheel": list(range(params.wheel.active.shape[-1])),
+        "ground": list(range(params.ground.active.shape[-1])),
+    }

@@ -1,0 +1,15 @@
+"""Pictures of scenes, posteriors and predictions; matplotlib comes at first use."""
+
+from boomdp_jax.viz.figure import plot_posterior as plot_posterior
+from boomdp_jax.viz.posteriors import draw_posterior as draw_posterior
+from boomdp_jax.viz.predictions import draw_prediction as draw_prediction
+from boomdp_jax.viz.scenes import draw_scene as draw_scene
+from boomdp_jax.viz.structures import draw_structure_bars as draw_structure_bars
+
+__all__ = [
+    "draw_posterior",
+    "draw_prediction",
+    "draw_scene",
+    "draw_structure_bars",
+    "plot_posterior",
+]

@@ -1,0 +1,174 @@
+"""Predicted bands against motion that the posterior has not seen."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from boomdp_jax.core.arrays import Key
+from boomdp_jax.core.history import History
+from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.predict import sample_readings, usable_starts
+from boomdp_jax.viz.style import BASELINE, PREDICTION, READING
+
+_sample = jax.jit(sample_readings)
+
+_LABELS = {
+    "x": "x [m]",
+    "y": "y [m]",
+    "theta": "angle [rad]",
+    "xdot": "velocity along x [m/s]",
+    "ydot": "velocity along y [m/s]",
+    "thetadot": "spin [rad/s]",
+}
+_COLUMNS = list(_LABELS)
+
+
+def draw_prediction(
+    ax: Any,
+    posterior: Posterior,
+    history: History,
+    *,
+    body: int | None = None,
+    quantity: str | None = None,
+    start: int | None = None,
+    num_steps: int = 50,
+    num_draws: int = 128,
+    key: Key | None = None,
+) -> None:
+    """Draw the 90 % band of one predicted quantity with the readings over it.
+
+    Args:
+        ax: a `matplotlib.axes.Axes`.
+        posterior: what is believed.
+        history: held-out readings and wrenches.
+        body: index of the body; default: the one that moves most.
+        quantity: x, y, theta, xdot, ydot or thetadot; default: of the first three the
+            one that moves most.
+        start: row to predict from; default: the one followed by the most motion.
+        num_steps: steps to predict; fewer where no episode is as long.
+        num_draws: draws of the posterior.
+        key: random key; default: that of seed 0.
+
+    Raises:
+        ValueError: no row has a complete reading to start from, too few rows follow
+            the start, or there is no such quantity.
+    """
+    spec, scene = posterior.spec, posterior.spec.scene
+    is_static = np.array([entry.is_static for entry in spec.bodies])
+    starts, num_steps = _starts(history, num_steps, is_static)
+    if start is None:
+        start = _liveliest(history, starts, num_steps, is_static)
+    rows = np.arange(start, start + num_steps)
+    if start < 0 or rows[-1] >= history.capacity:
+        raise ValueError(
+            f"start: expected {num_steps} rows after it, got row {start} of "
+            f"{history.capacity}"
+        )
+    reading, following = history.state[start], np.asarray(history.next_state)[rows]
+    body, quantity = _choose(np.asarray(reading), following, is_static, body, quantity)
+    if quantity not in _LABELS:
+        raise ValueError(f"quantity: expected one of {_COLUMNS}, got {quantity!r}")
+    column = _COLUMNS.index(quantity)
+    kept = posterior.thin(num_draws)
+    count = kept.num_draws
+    draws = _sample(
+        jax.random.key(0) if key is None else key,
+        scene,
+        kept.params,
+        kept.noise_scale,
+        jnp.broadcast_to(reading, (count, *reading.shape)),
+        jnp.broadcast_to(history.action[rows], (count, *history.action[rows].shape)),
+        jnp.broadcast_to(history.dt[rows], (count, num_steps)),
+        jnp.arange(num_steps),
+    )
+    time = np.concatenate([[0.0], np.cumsum(np.asarray(history.dt)[rows])])
+    first = float(reading[body, column])
+    values = np.asarray(draws[:, :, body, column])
+    low, middle, high = np.quantile(values, (0.05, 0.5, 0.95), axis=0)
+    rate = float(reading[body, column + 3]) if column < 3 else 0.0
+    ax.fill_between(
+        time[1:],
+        low,
+        high,
+        color=PREDICTION,
+        alpha=0.25,
+        linewidth=0,
+        label="predicted, 90 %",
+    )
+    ax.plot(
+        time[1:], middle, color=PREDICTION, linewidth=1.5, label="predicted, median"
+    )
+    ax.plot(
+        time,
+        first + rate * time,
+        color=BASELINE,
+        linestyle="--",
+        linewidth=1.2,
+        label="constant velocity",
+    )
+    is_read = np.asarray(history.next_state_mask)[rows, body, column]
+    seen = np.append(first, following[is_read, body, column])
+    ax.plot(
+        np.append(0.0, time[1:][is_read]),
+        seen,
+        linestyle="",
+        marker="o",
+        markersize=2.8,
+        color=READING,
+        label="held-out readings",
+    )
+    _fit_to(ax, np.concatenate([low, high, seen]))
+    ax.set_xlabel("time ahead [s]")
+    name = spec.bodies[body].name
+    ax.set_ylabel(f"{name}: {_LABELS[quantity]}")
+    ax.legend(fontsize=8, frameon=False)
+    ax.spines[["top", "right"]].set_visible(False)
+
+
+def _starts(
+    history: History, num_steps: int, is_static: np.ndarray
+) -> tuple[np.ndarray, int]:
+    """Rows to start from, with as many steps as an episode allows."""
+    for length in range(min(num_steps, history.capacity), 0, -1):
+        starts = usable_starts(history, length, is_static)
+        if len(starts):
+            return starts, length
+    raise ValueError("history: expected a row with a complete reading, got none")
+
+
+def _liveliest(
+    history: History, starts: np.ndarray, num_steps: int, is_static: np.ndarray
+) -> int:
+    """The start that is followed by the widest motion."""
+    pose = np.asarray(history.next_state)[:, ~is_static, :3]
+    spans = [
+        np.ptp(pose[start : start + num_steps], axis=0).max(initial=0.0)
+        for start in starts
+    ]
+    return int(starts[int(np.argmax(spans))])
+
+
+def _choose(
+    reading: np.ndarray,
+    following: np.ndarray,
+    is_static: np.ndarray,
+    body: int | None,
+    quantity: str | None,
+) -> tuple[int, str]:
+    """The body and the number that move most, where they are not given."""
+    span = np.ptp(np.concatenate([reading[None], following]), axis=0)[:, :3]
+    span = np.where(is_static[:, None], -1.0, span)
+    if body is None:
+        body = int(np.argmax(span.max(axis=1)))
+    if quantity is None:
+        quantity = _COLUMNS[int(np.argmax(span[body]))]
+    return body, quantity
+
+
+def _fit_to(ax: Any, values: np.ndarray) -> None:
+    """Fit the axis to predictions and readings, not to a baseline that runs away."""
+    values = values[np.isfinite(values)]
+    margin = 0.08 * max(float(np.ptp(values)), 1e-6)
+    ax.set_ylim(values.min() - margin, values.max() + margin)

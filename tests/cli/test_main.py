@@ -1,0 +1,142 @@
+"""The command line as a whole: arguments, exit status, one line on bad input."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from boomdp_jax.cli.main import main
+from boomdp_jax.cli.output import numbered, without_non_finite
+
+SCENE = """{"schema": "planar-scene-1", "gravity": [0, 0], "dt": 0.02,
+ "bodies": [{"name": "cart", "pose": [0, 0, 0],
+   "shape": {"type": "box", "half_extents": [0.5, 0.3]}}],
+ "unknown": {"wheel": 1}}"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder, made the current one, with a scene, rows and an empty recording."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.json").write_text(SCENE)
+    (tmp_path / "broken.json").write_text(SCENE[:50])
+    (tmp_path / "typo.json").write_text(SCENE.replace('"pose"', '"poze"'))
+    for name, num_rows in (("data.npz", 3), ("empty.npz", 0)):
+        np.savez(
+            name,
+            state=np.zeros((num_rows, 1, 6)),
+            action=np.zeros((num_rows, 1, 3)),
+            next_state=np.zeros((num_rows, 1, 6)),
+            dt=0.02,
+        )
+    np.savez("two_bodies.npz", action=np.zeros((3, 2, 3)))
+    np.savez("actions.npz", action=np.zeros((3, 1, 3)))
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("", "the following arguments are required: command"),
+        ("guess data.npz", "invalid choice: 'guess'"),
+        ("infer data.npz", "required: --scene"),
+        ("infer --scene scene.json", "required: DATA.npz"),
+        ("infer data.npz --scene scene.json --method smc", "auto"),
+        ("infer data.npz --scene scene.json --rows 0", "--rows: expected a whole"),
+        ("infer data.npz --scene scene.json --rows 1.5", "--rows: expected a whole"),
+        ("infer data.npz --scene scene.json --seed -1", "--seed: expected a whole"),
+        ("infer data.npz --scene missing.json", "missing.json: No such file"),
+        ("infer missing.npz --scene scene.json", "missing.npz: No such file"),
+        ("infer data.npz --scene broken.json", "broken.json: expected JSON"),
+        ("infer data.npz --scene typo.json", "typo.json: body 'cart'"),
+        ("infer scene.json --scene scene.json", "scene.json: expected an NPZ"),
+        ("infer empty.npz --scene scene.json", "empty.npz: expected at least one row"),
+        ("infer data.npz empty.npz --scene scene.json", "empty.npz: expected at least"),
+        (
+            "infer data.npz --scene scene.json --out no/post.npz",
+            "no/post.npz: expected",
+        ),
+        ("infer data.npz --scene scene.json --out .", ".: expected a file"),
+        ("infer data.npz --scene scene.json --plot fig.doc", "fig.doc: expected a fig"),
+        ("predict post.npz", "required: DATA.npz"),
+        ("predict post.npz data.npz --horizon 0", "--horizon: expected a whole"),
+        ("simulate scene.json --out o.npz", "required: --actions"),
+        (
+            "simulate scene.json --actions actions.npz --out o.npz",
+            "scene.json: body 'cart': density: expected a number, got unknown",
+        ),
+        (
+            "simulate scene.json --actions two_bodies.npz --out o.npz",
+            "two_bodies.npz: action: expected 1 bodies",
+        ),
+        (
+            "simulate scene.json --actions actions.npz --out o.npz --noise 1 1 -1 1",
+            "--noise: expected a finite number of at least 0, got '-1'",
+        ),
+        (
+            "simulate scene.json --actions actions.npz --out o.npz --draw 1",
+            "--draw: expected --posterior",
+        ),
+        (
+            "simulate scene.json --actions actions.npz --out no/o.npz",
+            "no/o.npz: expected an existing folder",
+        ),
+    ],
+)
+def test_bad_input_is_one_line_status_2_and_nothing_written(
+    folder: Path, capsys: pytest.CaptureFixture, command: str, message: str
+):
+    before = sorted(folder.iterdir())
+    assert main(command.split()) == 2
+    output = capsys.readouterr()
+    assert output.out == ""
+    errors = [line for line in output.err.splitlines() if ": error: " in line]
+    assert len(errors) == 1
+    assert message in errors[0]
+    others = [line for line in output.err.splitlines() if line not in errors]
+    assert all(line.startswith("boomdp_jax: note:") for line in others)
+    assert sorted(folder.iterdir()) == before
+
+
+def test_an_unknown_method_names_those_that_exist(
+    folder: Path, capsys: pytest.CaptureFixture
+):
+    assert main("infer data.npz --scene scene.json --method smc".split()) == 2
+    line = capsys.readouterr().err
+    assert all(name in line for name in ("'smc'", "auto", "rj", "nuts"))
+
+
+def test_help_is_status_0(capsys: pytest.CaptureFixture):
+    assert main(["infer", "--help"]) == 0
+    assert "--scene" in capsys.readouterr().out
+
+
+def test_the_module_runs_as_a_program(folder: Path):
+    finished = subprocess.run(
+        [sys.executable, "-m", "boomdp_jax", "infer", "data.npz"],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=Path(__file__).parents[2],
+    )
+    assert finished.returncode == 2
+    assert finished.stdout == ""
+    assert finished.stderr.splitlines() == [
+        "boomdp_jax: error: the following arguments are required: --scene"
+    ]
+
+
+def test_numbers_that_are_not_finite_become_null():
+    value = {"a": [1.0, float("nan"), {"b": float("inf")}], "c": "nan", "d": 2}
+    assert without_non_finite(value) == {
+        "a": [1.0, None, {"b": None}],
+        "c": "nan",
+        "d": 2,
+    }
+
+
+def test_several_results_are_numbered_and_one_is_not():
+    assert numbered("out/post.npz", 0, 1) == "out/post.npz"
+    assert numbered("out/post.npz", 1, 3) == str(Path("out/post-1.npz"))

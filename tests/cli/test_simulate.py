@@ -1,0 +1,179 @@
+"""`simulate`: recordings that follow closed forms, episode by episode."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from boomdp_jax.cli.main import main
+from boomdp_jax.core.history_file import load_transitions
+from boomdp_jax.physics.scene_file import load_scene
+
+DENSITY, HALF_EXTENTS, DT = 10.0, (0.5, 0.3), 0.02
+MASS = DENSITY * 4 * HALF_EXTENTS[0] * HALF_EXTENTS[1]
+INERTIA = MASS * (HALF_EXTENTS[0] ** 2 + HALF_EXTENTS[1] ** 2) / 3
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, with a free box beside a wall."""
+    monkeypatch.chdir(tmp_path)
+    scene = {
+        "schema": "planar-scene-1",
+        "gravity": [0, 0],
+        "dt": DT,
+        "bodies": [
+            {
+                "name": "wall",
+                "pose": [9, 0, 0],
+                "shape": {"type": "box", "half_extents": [0.1, 4]},
+                "static": True,
+            },
+            {
+                "name": "box",
+                "pose": [1, 2, 0.5],
+                "twist": [0.3, -0.1, 0.2],
+                "shape": {"type": "box", "half_extents": list(HALF_EXTENTS)},
+                "density": DENSITY,
+            },
+        ],
+    }
+    (tmp_path / "scene.json").write_text(json.dumps(scene))
+    return tmp_path
+
+
+def _action(num_rows: int, wrench: tuple[float, float, float]) -> np.ndarray:
+    action = np.zeros((num_rows, 2, 3))
+    action[:, 1] = wrench
+    return action
+
+
+def _simulate(options: str = "") -> None:
+    command = f"simulate scene.json --actions a.npz --out out.npz {options}"
+    assert main(command.split()) == 0
+
+
+def test_a_constant_wrench_accelerates_uniformly(folder: Path):
+    np.savez("a.npz", action=_action(25, (3.0, -2.0, 0.4)))
+    _simulate()
+    table = load_transitions("out.npz", spec=load_scene("scene.json"))
+    time = DT * np.arange(1, 26)[:, None]
+    rate = np.array([3.0 / MASS, -2.0 / MASS, 0.4 / INERTIA])
+    twist = np.array([0.3, -0.1, 0.2]) + rate * time
+    pose = np.array([1, 2, 0.5]) + np.array([0.3, -0.1, 0.2]) * time
+    np.testing.assert_allclose(table.next_state[:, 1, 3:], twist, rtol=1e-12)
+    np.testing.assert_allclose(
+        table.next_state[:, 1, :3], pose + rate * time**2 / 2, rtol=1e-10
+    )
+    np.testing.assert_array_equal(table.state[0, 1], [1, 2, 0.5, 0.3, -0.1, 0.2])
+    np.testing.assert_array_equal(table.state[1:], table.next_state[:-1])
+    np.testing.assert_array_equal(table.state[:, 0], table.next_state[:, 0])
+
+
+def test_a_force_at_a_point_turns_the_box(folder: Path):
+    arm = np.array([0.2, -0.1])
+    point = np.zeros((1, 2, 2))
+    point[0, 1] = np.array([1.0, 2.0]) + arm
+    np.savez("a.npz", action=_action(1, (3.0, -2.0, 0.4)), point=point)
+    _simulate()
+    table = load_transitions("out.npz")
+    torque = 0.4 + arm[0] * -2.0 - arm[1] * 3.0
+    spin = 0.2 + DT * torque / INERTIA
+    np.testing.assert_allclose(table.next_state[0, 1, 5], spin, rtol=1e-10)
+    np.testing.assert_array_equal(table.point, point)
+    # Read back, the recording holds the same wrench about the centre of mass.
+    np.testing.assert_allclose(table.to_history().action[0, 1, 2], torque, rtol=1e-10)
+
+
+def test_each_episode_starts_from_the_initial_state(folder: Path):
+    start = np.array([[9.0, 0, 0, 0, 0, 0], [0, 0, 0, 1.0, 0, 0]])
+    np.savez(
+        "a.npz",
+        action=_action(6, (0.0, 0.0, 0.0)),
+        episode=np.array([0, 0, 0, 1, 1, 1]),
+        initial_state=start,
+        dt=np.array([0.02, 0.02, 0.02, 0.04, 0.04, 0.04]),
+    )
+    command = "simulate scene.json --actions a.npz --out out.npz"
+    assert main(command.split()) == 0
+    table = load_transitions("out.npz")
+    np.testing.assert_allclose(
+        table.next_state[:, 1, 0], [0.02, 0.04, 0.06, 0.04, 0.08, 0.12], rtol=1e-12
+    )
+    np.testing.assert_array_equal(table.state[[0, 3]], np.stack([start, start]))
+    np.testing.assert_array_equal(table.episode, [0, 0, 0, 1, 1, 1])
+    np.testing.assert_allclose(table.dt, [0.02, 0.02, 0.02, 0.04, 0.04, 0.04])
+
+
+def test_a_noisy_instant_is_read_once_and_episodes_start_afresh(folder: Path):
+    num_rows = 4000
+    episode = np.repeat([0, 1], num_rows // 2)
+    np.savez("a.npz", action=_action(num_rows, (0.5, 0.2, 0.0)), episode=episode)
+    _simulate()
+    true = load_transitions("out.npz")
+    _simulate("--noise 0.001 0.002 0.03 0.04 --seed 7")
+    noisy = load_transitions("out.npz", spec=load_scene("scene.json"))
+    is_start = np.isin(np.arange(num_rows), [0, num_rows // 2])
+    previous = np.roll(noisy.next_state, 1, axis=0)
+    np.testing.assert_array_equal(noisy.state[~is_start], previous[~is_start])
+    assert np.all(noisy.state[is_start, 1] != true.state[is_start, 1])
+    error = (noisy.next_state - true.next_state)[:, 1]
+    scale = np.array([0.001, 0.001, 0.002, 0.03, 0.03, 0.04])
+    # The relative error of a standard deviation is 1 / sqrt(2 n) = 1.1 %: five of these
+    # in six channels is a false alarm in 300,000 runs.
+    np.testing.assert_allclose(np.std(error, axis=0), scale, rtol=0.056)
+    np.testing.assert_allclose(
+        np.mean(error, axis=0) / scale, 0.0, atol=5 / np.sqrt(num_rows)
+    )
+    correlation = np.corrcoef(error.T) - np.eye(6)
+    np.testing.assert_allclose(correlation, 0.0, atol=5 / np.sqrt(num_rows))
+
+
+def test_the_same_seed_gives_the_same_file(folder: Path):
+    np.savez("a.npz", action=_action(5, (0.5, 0.2, 0.1)))
+    contents = []
+    for seed in (3, 3, 4):
+        _simulate(f"--noise 0.01 0.01 0.01 0.01 --seed {seed}")
+        contents.append(Path("out.npz").read_bytes())
+    assert contents[0] == contents[1] != contents[2]
+
+
+def test_the_file_says_where_it_comes_from(folder: Path):
+    np.savez("a.npz", action=_action(2, (0.5, 0.2, 0.1)))
+    _simulate("--noise 0.1 0.1 0.1 0.1 --seed 3")
+    origin = json.loads(load_transitions("out.npz").params)
+    assert origin["seed"] == 3
+    assert origin["noise"] == [0.1, 0.1, 0.1, 0.1]
+    assert origin["scene"] == load_scene("scene.json").to_dict()
+    assert "jax" in origin["versions"]
+
+
+def test_another_step_length_is_told_on_standard_error(
+    folder: Path, capsys: pytest.CaptureFixture
+):
+    np.savez("a.npz", action=_action(2, (0.5, 0.2, 0.1)), dt=0.05)
+    _simulate()
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert output.err.splitlines() == [
+        "boomdp_jax: warning: a.npz: dt: 0.05 s overrides the scene's 0.02 s"
+    ]
+
+
+def test_a_missing_start_is_refused(folder: Path, capsys: pytest.CaptureFixture):
+    scene = Path("scene.json").read_text().replace('"pose": [1, 2, 0.5], ', "")
+    Path("scene.json").write_text(scene)
+    np.savez("a.npz", action=_action(2, (0.5, 0.2, 0.1)))
+    assert main("simulate scene.json --actions a.npz --out out.npz".split()) == 2
+    assert "body 'box': pose: expected a pose" in capsys.readouterr().err
+    assert not Path("out.npz").exists()
+
+
+def test_a_motion_that_overflows_is_refused(
+    folder: Path, capsys: pytest.CaptureFixture
+):
+    np.savez("a.npz", action=_action(3, (1e308, 1e308, 0.0)), dt=1e3)
+    assert main("simulate scene.json --actions a.npz --out out.npz".split()) == 2
+    assert "body 'box': expected a motion that stays finite" in capsys.readouterr().err
+    assert not Path("out.npz").exists()
