@@ -1,5 +1,6 @@
 """Set-up of every test: 64 bit, ranks that never broadcast silently, checked shapes."""
 
+import gc
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -10,6 +11,18 @@ from jaxtyping import install_import_hook
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 install_import_hook("boomdp_jax", "beartype.beartype")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _drop_programs() -> Iterator[None]:
+    """Let go of a module's compiled programs when it is done.
+
+    Each holds several memory mappings, of which a process may have 65,530 on Linux;
+    all tests together need more, and the compiler then crashes.
+    """
+    yield
+    jax.clear_caches()
+    gc.collect()
 
 
 class Precision(NamedTuple):
