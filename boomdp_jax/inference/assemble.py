@@ -9,6 +9,7 @@ import numpy as np
 
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.inference.block import Block
+from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.one_step import NOISE_SHAPE
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.sample import BlockDraws
@@ -27,9 +28,26 @@ class BlockResult(NamedTuple):
     place: int
 
 
+# Draws decoded by one call of the compiled program, whatever their number.
+_DRAWS_PER_CALL = 1024
+
+
 @eqx.filter_jit
-def _decode(coordinates, z, active):
+def _decode_some(coordinates, z, active):
     return jax.vmap(coordinates)(z, active)
+
+
+def _decode(coordinates, z: np.ndarray, active: np.ndarray) -> Params:
+    """Params of many draws."""
+    num = len(z)
+    parts = []
+    for begin in range(0, num, _DRAWS_PER_CALL):
+        rows = np.minimum(np.arange(begin, begin + _DRAWS_PER_CALL), num - 1)
+        part = _decode_some(
+            coordinates, jnp.asarray(z[rows]), jnp.asarray(active[rows])
+        )
+        parts.append(jax.tree.map(np.asarray, part))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:num], *parts)
 
 
 def assemble_posterior(
@@ -59,21 +77,18 @@ def assemble_posterior(
     for number, result in enumerate(results):
         block, draws, place = result
         target = block.target
-        active = target.structures[draws.structure[place]]
+        active = np.asarray(target.structures)[np.asarray(draws.structure[place])]
         likelihood: Any = target.log_likelihood
         coordinates = likelihood.coordinates
-        posterior_parts.append(_decode(coordinates, draws.z[place], active))
-        prior_key, noise_key = jax.random.split(jax.random.fold_in(key, number))
-        z = _prior_coordinates(prior_key, target)
-        every = jnp.ones((NUM_PRIOR_DRAWS, target.structures.shape[1]), bool)
+        posterior_parts.append(_decode(coordinates, np.asarray(draws.z[place]), active))
+        rng = host_generator(jax.random.fold_in(key, number))
+        z = _prior_coordinates(rng, target)
+        every = np.ones((NUM_PRIOR_DRAWS, target.structures.shape[1]), bool)
         prior_parts.append(_decode(coordinates, z, every))
         noise_parts.append(draws.noise_scale[place])
         shape = (NUM_PRIOR_DRAWS, len(block.bodies), 4)
-        scale = coordinates.scales.noise
-        prior_noise_parts.append(
-            scale[None, None]
-            / jnp.sqrt(jax.random.gamma(noise_key, NOISE_SHAPE, shape))
-        )
+        scale = np.asarray(coordinates.scales.noise)
+        prior_noise_parts.append(scale / np.sqrt(rng.gamma(NOISE_SHAPE, size=shape)))
     blocks = [r.block for r in results]
     params, inferred = _merge(spec, blocks, posterior_parts)
     prior_params, _ = _merge(spec, blocks, prior_parts)
@@ -102,12 +117,12 @@ def assemble_posterior(
     )
 
 
-def _prior_coordinates(key: Key, target):
-    normal_key, angle_key = jax.random.split(key)
+def _prior_coordinates(rng: np.random.Generator, target) -> np.ndarray:
+    period = np.asarray(target.period)
     shape = (NUM_PRIOR_DRAWS, target.dim)
-    period = target.period[None]
-    angle = period * (jax.random.uniform(angle_key, shape) - 0.5)
-    return jnp.where(period > 0, angle, jax.random.normal(normal_key, shape))
+    angle = period * (rng.random(shape) - 0.5)
+    z = np.where(period > 0, angle, rng.standard_normal(shape))
+    return z.astype(target.log_prior.dtype)
 
 
 def _merge(

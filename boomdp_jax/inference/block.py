@@ -8,10 +8,13 @@ import numpy as np
 
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.coordinates import Coordinates, surroundings
+from boomdp_jax.inference.filtered_likelihood import FilteredLikelihood
+from boomdp_jax.inference.kalman import channel_scale
 from boomdp_jax.inference.layout import Layout, block_layout, structures
-from boomdp_jax.inference.one_step import OneStepLikelihood, readings
 from boomdp_jax.inference.prior import prior_scales, read_prior
 from boomdp_jax.inference.target import StructureTarget
+from boomdp_jax.inference.track_data import track_data
+from boomdp_jax.inference.tracking import one_step_gains
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.scene_spec import SceneSpec
 
@@ -32,6 +35,9 @@ class Block(NamedTuple):
 def make_block(spec: SceneSpec, bodies: tuple[int, ...], history: History) -> Block:
     """Set up the posterior of a block.
 
+    Its likelihood starts out as the one-step likelihood; a fit then gives it the gains
+    of a filter.
+
     Args:
         spec: the scene.
         bodies: which of its bodies.
@@ -51,9 +57,20 @@ def make_block(spec: SceneSpec, bodies: tuple[int, ...], history: History) -> Bl
         scene=_block_scene(spec.scene, bodies),
     )
     dt = np.asarray(history.dt)[np.asarray(history.mask)]
-    data = readings(history, bodies, bool(dt.size == 0 or np.all(dt == dt[0])))
+    data = track_data(history, bodies, bool(dt.size == 0 or np.all(dt == dt[0])))
+    reference = jnp.tile(coordinates.scales.noise[None], (len(bodies), 1))
+    gains = one_step_gains(data, channel_scale(reference))
     target = StructureTarget(
-        log_likelihood=OneStepLikelihood(coordinates, data),
+        log_likelihood=FilteredLikelihood(
+            coordinates=coordinates,
+            data=data,
+            structures=jnp.asarray(rows),
+            gains=jax.tree.map(
+                lambda leaf: jnp.broadcast_to(leaf[None], (len(rows), *leaf.shape)),
+                gains,
+            ),
+            reference=reference,
+        ),
         structures=jnp.asarray(rows),
         log_prior=jnp.asarray(log_prior, float),
         slot=jnp.asarray(layout.slot_of_coordinate(), jnp.int32),

@@ -6,7 +6,7 @@ constant, of any scalar that the caller adds (a total mass, a prediction), and o
 coordinates within the most probable structure.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,8 +14,21 @@ from jaxtyping import Array, Float
 from numpyro.diagnostics import effective_sample_size, split_gelman_rubin
 
 from boomdp_jax.inference.moves import MOVES
-from boomdp_jax.inference.structure_chain import ChainDraws, RunInfo
+from boomdp_jax.inference.structure_chain import ChainDraws
 from boomdp_jax.inference.target import StructureTarget
+
+
+@runtime_checkable
+class Counted(Protocol):
+    """Proposals made and accepted, `[any, move, 2]`; see `ChainInfo`."""
+
+    @property
+    def proposed(self) -> Any:
+        """Proposals that were made."""
+
+    @property
+    def accepted(self) -> Any:
+        """Those that were accepted."""
 
 
 class ChainDiagnostics(NamedTuple):
@@ -33,7 +46,7 @@ class ChainDiagnostics(NamedTuple):
 def diagnose_chains(
     target: StructureTarget,
     draws: ChainDraws,
-    info: RunInfo | None = None,
+    info: Counted | None = None,
     *,
     scalars: dict[str, Float[Array, "chain draw"]] | None = None,
     max_r_hat: float = 1.05,
@@ -44,7 +57,7 @@ def diagnose_chains(
     Args:
         target: says which slots a structure has.
         draws: of `run_chains`.
-        info: of `run_chains`; adds acceptance rates and the check for stuck chains.
+        info: counts of moves; adds acceptance rates and the check for stuck chains.
         scalars: further numbers that mean the same in every structure.
         max_r_hat: largest split R-hat that passes.
         min_sample_size: smallest effective sample size that passes.
@@ -111,7 +124,7 @@ def _within_structure(
     return {name: value for name, value in series.items() if np.ptp(value) > 0}
 
 
-def _acceptance(info: RunInfo) -> dict[str, float]:
+def _acceptance(info: Counted) -> dict[str, float]:
     proposed = np.sum(np.asarray(info.proposed), axis=0)
     accepted = np.sum(np.asarray(info.accepted), axis=0)
     rates = {}

@@ -1,12 +1,13 @@
 r"""Find the modes of every structure: many starts, Gauss-Newton with damping.
 
-With the noise integrated out the gradient of the log-likelihood is $-J^T W r$ with
-weights W that depend on the residuals r themselves; $J^T W J$ plus the prior's
-identity serves as the Hessian (the part left out is of rank one per noise group).
-Levenberg (1944) and Marquardt (1963), with three dampings tried at a time.
+With the noise integrated out the gradient of the log-likelihood is $-J^T W u$ with
+innovations u and weights W that depend on the innovations themselves; $J^T W J$ plus
+the prior's identity serves as the Hessian (the part left out is of rank one per noise
+group). Levenberg (1944) and Marquardt (1963), with three dampings tried at a time.
 
-The loop over iterations runs on the host, so that the physics is compiled once for
-values and once for Jacobians, whatever the number of stages.
+Everything but the physics runs on the host: points are evaluated in large batches by
+`evaluate_points`, the Jacobian is by differences (one plain evaluation per coordinate
+in use), and small linear systems are solved by NumPy.
 """
 
 from typing import Any, NamedTuple
@@ -14,20 +15,22 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
-from boomdp_jax.core.arrays import Key
-from boomdp_jax.inference.one_step import (
-    NoiseStatistics,
-    group_sums,
-    noise_precision,
-)
-from boomdp_jax.inference.seeds import random_starts
+from boomdp_jax.inference.evaluate import evaluate_points
+from boomdp_jax.inference.one_step import NOISE_SHAPE
+from boomdp_jax.inference.seeds import random_starts, seed_coordinates
 from boomdp_jax.inference.target import StructureTarget
 
-# Step of the differences, in prior standard deviations: small beside any posterior
-# width that data allow, large beside the rounding of single precision.
-_DIFFERENCE = 1e-3
+_GROUP = np.array([0, 0, 1, 2, 2, 3])
+_DAMPING_FACTORS = np.array([0.1, 1.0, 10.0])
+# A fit whose log-density gains less than this in an iteration has arrived.
+_ARRIVED = 1e-3
+# Steps of the differences in posterior standard deviations, and their limits in prior
+# ones by float size: above the rounding of the prediction, below its curvature.
+_DIFFERENCE = 0.2
+_DIFFERENCE_LIMITS = {4: (1e-3, 3e-2), 8: (1e-5, 1e-2)}
 
 
 class FitSettings(NamedTuple):
@@ -38,7 +41,7 @@ class FitSettings(NamedTuple):
     num_starts: int = 4
     """Best of them that are fitted."""
     num_iterations: int = 12
-    """Of each of the two rounds: from anywhere, and from smaller structures' modes."""
+    """Most iterations of each round: from anywhere, then from smaller structures."""
     num_modes: int = 3
     """Distinct modes that are kept."""
 
@@ -53,255 +56,338 @@ class Modes(NamedTuple):
     """Minus infinity where a structure has no further mode."""
 
 
-def fit_modes(
-    key: Key, targets: StructureTarget, settings: FitSettings | None = None
-) -> Modes:
-    """Fit every structure of many objects from many starts; keep distinct optima.
+class Fits(NamedTuple):
+    """A flat list of points on their way to optima, on the host."""
+
+    index: np.ndarray
+    """Object of each."""
+    structure: np.ndarray
+    z: np.ndarray
+    value: np.ndarray
+    """Log-density."""
+    precision: np.ndarray
+    """Gauss-Newton matrix at the last point where it was formed, `[fit, dim, dim]`."""
+
+    def take(self, rows: np.ndarray) -> "Fits":
+        """Some of them."""
+        return Fits(*(part[rows] for part in self))
+
+
+def join_fits(*parts: Fits) -> Fits:
+    """Several lists as one."""
+    return Fits(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+class Host(NamedTuple):
+    """What a fit needs of the targets, on the host."""
+
+    in_use: np.ndarray
+    """`[structure, dim]`."""
+    is_normal: np.ndarray
+    """Coordinates with a normal prior, `[dim]`."""
+    period: np.ndarray
+    rate: np.ndarray
+    """Rate of the noise factor's prior, `[object, body, 4]`."""
+
+    @classmethod
+    def of(cls, targets: StructureTarget) -> "Host":
+        """Read it off stacked targets."""
+        structures, slot = (
+            np.asarray(targets.structures[0]),
+            np.asarray(targets.slot[0]),
+        )
+        active = np.concatenate(
+            [structures, np.ones((len(structures), 1), bool)], axis=1
+        )
+        period = np.asarray(targets.period[0], float)
+        likelihood: Any = targets.log_likelihood
+        scale = np.asarray(likelihood.coordinates.scales.noise, float)
+        reference = np.asarray(likelihood.reference, float)
+        return cls(
+            in_use=active[:, slot],
+            is_normal=period == 0,
+            period=period,
+            rate=(scale[:, None] / reference) ** 2,
+        )
+
+    def wrap(self, z: np.ndarray) -> np.ndarray:
+        """Bring angles into half a period about zero."""
+        period = np.where(self.period > 0, self.period, 1.0)
+        return np.where(self.period > 0, z - period * np.floor(z / period + 0.5), z)
+
+
+def make_fits(
+    targets: StructureTarget, index: np.ndarray, structure: np.ndarray, z: np.ndarray
+) -> Fits:
+    """Points with their log-densities, no matrix formed yet."""
+    value = evaluate_points(targets, index, structure, z).log_density
+    precision = np.broadcast_to(np.eye(z.shape[1]), (len(z), z.shape[1], z.shape[1]))
+    return Fits(index, structure, z, value, precision.copy())
+
+
+def best_of_each(
+    fits: Fits, num_structures: int, num: int, *, min_distance: float = 0.0
+) -> Fits:
+    """The highest few of every object and structure, highest first.
 
     Args:
-        key: source of starts.
-        targets: with a `OneStepLikelihood`, stacked along a leading object axis.
-        settings: how hard to look.
+        fits: to choose from.
+        num_structures: of every object.
+        num: how many of each to keep at most.
+        min_distance: of two closer than this, in standard deviations of the higher,
+            only the higher is kept.
 
     Returns:
-        Up to `num_modes` modes per structure and object.
+        The chosen ones, sorted by object and structure.
     """
-    settings = FitSettings() if settings is None else settings
-    num_objects, num_structures = targets.structures.shape[:2]
-    keys = jax.random.split(key, (2, num_objects))
-    draws = _first_draws(keys[0], targets, settings.num_draws)
-    z, value = _fit(targets, draws, settings)
-    best = jnp.take_along_axis(z, jnp.argmax(value, axis=2)[..., None, None], axis=2)
-    grown = _grown_draws(keys[1], targets, best[:, :, 0], settings.num_draws)
-    more, more_value = _fit(targets, grown, settings)
-    z = jnp.concatenate([z, more], axis=2)
-    value = jnp.concatenate([value, more_value], axis=2)
-    found = []
-    for _ in range(settings.num_modes):
-        index = jnp.argmax(value, axis=2)
-        top = jnp.take_along_axis(z, index[..., None, None], axis=2)
-        height = jnp.take_along_axis(value, index[..., None], axis=2)
-        _, precision = _normal_equations(targets, _padded(top, settings))
-        precision = precision[:, :, :1]
-        found.append((top[:, :, 0], precision[:, :, 0], height[:, :, 0]))
-        value = _strike_out(targets, z, value, top[:, :, 0], precision[:, :, 0])
-    num = num_structures * settings.num_modes
-    z, precision, value = (jnp.stack(part, axis=2) for part in zip(*found, strict=True))
-    structure = jnp.repeat(jnp.arange(num_structures), settings.num_modes)
-    return Modes(
-        structure=jnp.broadcast_to(structure, (num_objects, num)),
-        z=z.reshape(num_objects, num, -1),
-        precision=precision.reshape(num_objects, num, z.shape[-1], z.shape[-1]),
-        log_density=value.reshape(num_objects, num),
+    group = fits.index * num_structures + fits.structure
+    chosen: list[int] = []
+    for name in np.unique(group):
+        members = np.flatnonzero(group == name)
+        members = members[np.argsort(-fits.value[members], kind="stable")]
+        kept: list[int] = []
+        for row in map(int, members):
+            if len(kept) == num:
+                break
+            if min_distance == 0.0 or all(
+                _distance(fits, other, row) >= min_distance for other in kept
+            ):
+                kept.append(row)
+        chosen += kept
+    return fits.take(np.array(chosen, int))
+
+
+def _distance(fits: Fits, first: int, second: int) -> float:
+    offset = fits.z[second] - fits.z[first]
+    return float(np.sqrt(max(offset @ fits.precision[first] @ offset, 0.0)))
+
+
+def climb(targets: StructureTarget, fits: Fits, num_iterations: int) -> Fits:
+    """Take points to their optima.
+
+    Args:
+        targets: with a `FilteredLikelihood`, stacked along a leading object axis.
+        fits: where to start.
+        num_iterations: most iterations.
+
+    Returns:
+        The same list, uphill.
+    """
+    host = Host.of(targets)
+    z, value = fits.z.astype(float).copy(), fits.value.copy()
+    precision = fits.precision.copy()
+    damping = np.full(len(value), 0.1)
+    is_moving = np.isfinite(value)
+    for _ in range(num_iterations):
+        rows = np.flatnonzero(is_moving)
+        if rows.size == 0:
+            break
+        current = Fits(
+            fits.index[rows],
+            fits.structure[rows],
+            z[rows],
+            value[rows],
+            precision[rows],
+        )
+        gradient, matrix = normal_equations(targets, host, current)
+        precision[rows] = matrix
+        points = _attempts(host, current.z, gradient, matrix, damping[rows])
+        num = len(_DAMPING_FACTORS)
+        tried = evaluate_points(
+            targets,
+            np.repeat(current.index, num),
+            np.repeat(current.structure, num),
+            points.reshape(-1, points.shape[-1]),
+        ).log_density.reshape(-1, num)
+        best = np.argmax(np.where(np.isnan(tried), -np.inf, tried), axis=1)
+        each = np.arange(len(rows))
+        found = tried[each, best]
+        is_better = found > value[rows]
+        gain = np.where(is_better, found - value[rows], 0.0)
+        z[rows] = np.where(is_better[:, None], points[each, best], z[rows])
+        value[rows] = np.where(is_better, found, value[rows])
+        factor = np.where(is_better, 0.5 * _DAMPING_FACTORS[best], 20.0)
+        damping[rows] = np.clip(damping[rows] * factor, 1e-6, 1e4)
+        has_arrived = is_better & (gain < _ARRIVED) | (damping[rows] > 1e3)
+        is_moving[rows] = ~has_arrived
+    return Fits(fits.index, fits.structure, z, value, precision)
+
+
+def normal_equations(
+    targets: StructureTarget, host: Host, fits: Fits
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient of minus the log-density, and its Gauss-Newton matrix, of each point.
+
+    Rows of coordinates that are not in use are those of the identity.
+    """
+    dim = fits.z.shape[1]
+    in_use = host.in_use[fits.structure]
+    size = np.dtype(targets.log_prior.dtype).itemsize
+    low, high = _DIFFERENCE_LIMITS[size]
+    length = np.diagonal(fits.precision, axis1=1, axis2=2)
+    delta = np.clip(_DIFFERENCE / np.sqrt(np.maximum(length, 1.0)), low, high)
+    fit, coordinate = np.nonzero(in_use)
+    moved = fits.z[fit].copy()
+    moved[np.arange(len(fit)), coordinate] += delta[fit, coordinate]
+    found = evaluate_points(
+        targets,
+        np.concatenate([fits.index, fits.index[fit]]),
+        np.concatenate([fits.structure, fits.structure[fit]]),
+        np.concatenate([fits.z, moved]),
+        with_innovations=True,
     )
-
-
-def _padded(points, settings: FitSettings):
-    """As many copies as there are starts, to reuse the compiled program."""
-    return jnp.repeat(points, settings.num_starts, axis=2)
-
-
-def _fit(targets: StructureTarget, draws, settings: FitSettings):
-    """Take the best draws of every structure to their optima.
-
-    Returns:
-        Optima `[object structure start dim]` and log-densities.
-    """
-    value = _log_densities(targets, draws)
-    value, index = jax.lax.top_k(value, settings.num_starts)
-    z = jnp.take_along_axis(draws, index[..., None], axis=2)
-    damping = jnp.full(value.shape, 0.1, value.dtype)
-    num_draws = draws.shape[2]
-    for _ in range(settings.num_iterations):
-        gradient, matrix = _normal_equations(targets, z)
-        points = _attempts(z, gradient, matrix, damping)
-        flat = points.reshape(*points.shape[:2], -1, points.shape[-1])
-        # Filled up to the number of draws: one compiled program serves both.
-        missing = num_draws - flat.shape[2]
-        if missing > 0:
-            filler = jnp.repeat(flat[:, :, :1], missing, axis=2)
-            flat = jnp.concatenate([flat, filler], axis=2)
-        values = _log_densities(targets, flat)[:, :, : num_draws - max(missing, 0)]
-        values = values.reshape(points.shape[:-1])
-        z, value, damping = _choose(targets, z, value, damping, points, values)
-    return z, value
-
-
-@eqx.filter_jit
-def evaluate_points(
-    targets: StructureTarget,
-    structure: Int[Array, "object point"],
-    z: Float[Array, "object point dim"],
-) -> tuple[Float[Array, "object point"], NoiseStatistics]:
-    """Log-density and noise statistics at many points of many objects.
-
-    Args:
-        targets: with a `OneStepLikelihood`, stacked along a leading object axis.
-        structure: of each point.
-        z: coordinates of each point.
-
-    Returns:
-        Log-densities, and counts and sums of squares `[object, point, body, 4]`.
-    """
-
-    def one(target, k, z):
-        likelihood: Any = target.log_likelihood
-        statistics = likelihood.statistics(z, target.structures[k])
-        value = likelihood.log_marginal(statistics)
-        return target.log_prior_density(k, z) + value, statistics
-
-    return jax.vmap(jax.vmap(one, (None, 0, 0)))(targets, structure, z)
-
-
-def _log_densities(targets: StructureTarget, z: Float[Array, "o k n dim"]):
-    num_objects, num_structures, num, dim = z.shape
-    structure = jnp.repeat(jnp.arange(num_structures), num)
-    structure = jnp.broadcast_to(structure, (num_objects, num_structures * num))
-    flat = z.reshape(num_objects, -1, dim)
-    return evaluate_points(targets, structure, flat)[0].reshape(z.shape[:3])
-
-
-@eqx.filter_jit
-def _normal_equations(targets: StructureTarget, points: Float[Array, "o k n dim"]):
-    def one_object(target, points):
-        structures = jnp.arange(target.num_structures)
-        each = jax.vmap(lambda k, z: gauss_newton(target, k, z), (None, 0))
-        return jax.vmap(each)(structures, points)
-
-    return jax.vmap(one_object)(targets, points)
-
-
-def gauss_newton(
-    target: StructureTarget, structure: Int[Array, ""], z: Float[Array, " dim"]
-) -> tuple[Float[Array, " dim"], Float[Array, "dim dim"]]:
-    """Gradient of minus the log-density, and its Gauss-Newton matrix.
-
-    The Jacobian is by differences: one plain prediction per coordinate, all in one
-    batch, at the full speed of the engine.
-
-    Args:
-        target: with a `OneStepLikelihood`.
-        structure: which one.
-        z: coordinates.
-
-    Returns:
-        Gradient and matrix; rows of coordinates not in use are those of the identity.
-    """
-    likelihood: Any = target.log_likelihood
-    active = target.structures[structure]
-    offsets = _DIFFERENCE * jnp.eye(target.dim, dtype=z.dtype)
-    points = z[None] + jnp.concatenate([jnp.zeros_like(z)[None], offsets])
-    every = jax.vmap(lambda p: likelihood.residuals(p, active))(points)
-    r, shape = every[0], (target.dim, -1)
-    jacobian = (every[1:] - every[:1]).reshape(shape).T / _DIFFERENCE
-    statistics = NoiseStatistics(group_sums(likelihood.data.mask), group_sums(r**2))
-    scale = likelihood.coordinates.scales.noise
-    weight = noise_precision(statistics, scale)[None]
-    weight = jnp.broadcast_to(weight, r.shape).reshape(-1)
-    jacobian = jnp.where(jnp.isfinite(jacobian), jacobian, 0.0)
-    in_use = target.in_use(structure)
-    is_normal = in_use & (target.period == 0)
+    assert found.innovation is not None
+    innovation = found.innovation.astype(float)
+    u, changed = innovation[: len(fits.z)], innovation[len(fits.z) :]
+    jacobian = np.zeros((len(fits.z), dim, u.shape[1]))
+    jacobian[fit, coordinate] = (changed - u[fit]) / delta[fit, coordinate][:, None]
+    jacobian = np.where(np.isfinite(jacobian), jacobian, 0.0)
+    num, square = found.num[: len(fits.z)], found.square[: len(fits.z)]
+    weight = (NOISE_SHAPE + 0.5 * num) / (host.rate[fits.index] + 0.5 * square)
+    weight = np.where(np.isfinite(weight), weight, 0.0)[..., _GROUP]
+    weight = np.tile(weight.reshape(len(fits.z), -1), (1, u.shape[1] // weight[0].size))
     weighted = jacobian * weight[:, None]
-    gradient = weighted.T @ r.reshape(-1) + jnp.where(is_normal, z, 0.0)
-    matrix = weighted.T @ jacobian + jnp.diag(is_normal.astype(z.dtype))
-    both = in_use[:, None] & in_use[None, :]
-    return (
-        jnp.where(in_use, gradient, 0.0),
-        jnp.where(both, matrix, jnp.eye(target.dim, dtype=z.dtype)),
+    prior = in_use & host.is_normal[None]
+    gradient = np.einsum("fdr,fr->fd", weighted, np.nan_to_num(u))
+    gradient += np.where(prior, fits.z, 0.0)
+    matrix = weighted @ np.swapaxes(jacobian, 1, 2)
+    each = np.arange(dim)
+    matrix[:, each, each] += prior
+    both = in_use[:, :, None] & in_use[:, None, :]
+    matrix = np.where(both, matrix, np.eye(dim)[None])
+    return np.where(in_use, gradient, 0.0), matrix
+
+
+def _attempts(host: Host, z, gradient, matrix, damping) -> np.ndarray:
+    """Damped steps for three dampings, `[fit, 3, dim]`."""
+    length = np.sqrt(np.maximum(np.diagonal(matrix, axis1=1, axis2=2), 1e-6))
+    unit = matrix / (length[:, :, None] * length[:, None, :])
+    strength = damping[:, None] * _DAMPING_FACTORS[None]
+    eye = np.eye(z.shape[1])
+    damped = unit[:, None] + strength[..., None, None] * eye
+    right = np.repeat((gradient / length)[:, None, :], strength.shape[1], axis=1)
+    step = np.linalg.solve(damped, right[..., None])[..., 0] / length[:, None, :]
+    points = z[:, None, :] - step
+    return host.wrap(np.where(np.isfinite(points), points, z[:, None, :]))
+
+
+class Guesses(NamedTuple):
+    """Where pins and axles would have to be, on the host; see `seeds`."""
+
+    z: np.ndarray
+    """`[object, dim]`."""
+    has: np.ndarray
+
+    @classmethod
+    def of(cls, targets: StructureTarget) -> "Guesses":
+        """Solve for them."""
+        z, has = _guesses(targets)
+        return cls(np.asarray(z, float), np.asarray(has))
+
+
+@eqx.filter_jit
+def _guesses(targets: StructureTarget):
+    likelihood: Any = targets.log_likelihood
+    return jax.vmap(lambda x: seed_coordinates(x.coordinates, x.data.steps))(likelihood)
+
+
+def first_fits(
+    rng: np.random.Generator,
+    targets: StructureTarget,
+    guesses: Guesses,
+    settings: FitSettings,
+) -> Fits:
+    """The best of many starts of every structure, before any climb."""
+    num_structures = targets.structures.shape[1]
+    host = Host.of(targets)
+    draws = np.stack(
+        [
+            random_starts(rng, z, has, host.period, settings.num_draws)
+            for z, has in zip(*guesses, strict=True)
+        ]
     )
+    draws = np.where(host.in_use[None, :, None], draws[:, None], 0.0)
+    return _best_draws(targets, draws, num_structures, settings.num_starts)
 
 
-@jax.jit
-def _attempts(z, gradient, matrix, damping):
-    """Damped steps for three dampings, `[... start 3 dim]`."""
-    diagonal = jnp.diagonal(matrix, axis1=-2, axis2=-1)
-    length = jnp.sqrt(jnp.maximum(diagonal, 1e-6))
-    unit = matrix / (length[..., :, None] * length[..., None, :])
-    factors = jnp.asarray([0.1, 1.0, 10.0], z.dtype)
-    strength = jnp.stack([damping * factor for factor in factors], axis=-1)
-    eye = jnp.broadcast_to(jnp.eye(z.shape[-1], dtype=z.dtype), unit.shape)
-    eye = eye[..., None, :, :]
-    damped = unit[..., None, :, :] + strength[..., None, None] * eye
-    right = jnp.broadcast_to(
-        (gradient / length)[..., None, :], (*strength.shape, z.shape[-1])
-    )
-    step = jnp.linalg.solve(damped, right[..., None])[..., 0] / length[..., None, :]
-    points = z[..., None, :] - step
-    return jnp.where(jnp.isfinite(points), points, z[..., None, :])
+def grown_fits(
+    rng: np.random.Generator,
+    targets: StructureTarget,
+    guesses: Guesses,
+    fits: Fits,
+    settings: FitSettings,
+) -> Fits:
+    """Starts of every structure from the best fits of structures with one slot less.
 
-
-@eqx.filter_jit
-def _choose(targets: StructureTarget, z, value, damping, points, values):
-    """The best attempt where it is better, and the next damping."""
-    values = jnp.where(jnp.isnan(values), -jnp.inf, values)
-    index = jnp.argmax(values, axis=-1)
-    best = jnp.take_along_axis(values, index[..., None], axis=-1)[..., 0]
-    point = jnp.take_along_axis(points, index[..., None, None], axis=-2)[..., 0, :]
-    is_better = best > value
-    factor = jnp.asarray([0.1, 1.0, 10.0], z.dtype)[index]
-    damping = jnp.where(is_better, damping * factor * 0.5, damping * 20.0)
-    z = jnp.where(is_better[..., None], point, z)
-    wrap = jax.vmap(lambda t, p: jax.vmap(jax.vmap(t.wrap))(p))
-    return (
-        wrap(targets, z),
-        jnp.where(is_better, best, value),
-        jnp.clip(damping, 1e-6, 1e4),
-    )
-
-
-@eqx.filter_jit
-def _strike_out(targets: StructureTarget, z, value, taken, precision):
-    """Drop candidates within three standard deviations of an optimum already taken."""
-
-    def one(target, z, value, taken, precision):
-        offset = jax.vmap(target.wrap)(z - taken[None])
-        distance = jnp.einsum("pi,ij,pj->p", offset, precision, offset)
-        return jnp.where(distance < 9.0, -jnp.inf, value)
-
-    over = jax.vmap(jax.vmap(one, (None, 0, 0, 0, 0)))
-    return over(targets, z, value, taken, precision)
-
-
-@eqx.filter_jit
-def _first_draws(keys, targets: StructureTarget, num: int):
-    """Starts for every structure, coordinates not in use at zero."""
-
-    def one(key, target):
-        likelihood = target.log_likelihood
-        draws = random_starts(key, likelihood.coordinates, likelihood.data, num)
-        in_use = jax.vmap(target.in_use)(jnp.arange(target.num_structures))
-        return jnp.where(in_use[:, None], draws[None], 0.0)
-
-    return jax.vmap(one)(keys, targets)
-
-
-@eqx.filter_jit
-def _grown_draws(keys, targets: StructureTarget, best, num: int):
-    """Modes of structures with one slot less, the slot's coordinates from the prior.
-
-    A structure that no smaller one leads to gets its own mode. The first draw of every
-    structure is its own mode, so that the second round also polishes the first.
+    The slot's own coordinates come from the prior, or from a guess. A structure that no
+    smaller one leads to starts from its own best fit, and so does the first start of
+    every structure.
     """
+    num_objects, num_structures = targets.structures.shape[:2]
+    host = Host.of(targets)
+    best = best_of_each(fits, num_structures, 1)
+    z = best.z.reshape(num_objects, num_structures, -1)
+    num = settings.num_draws
+    draws = np.empty((num_objects, num_structures, num, z.shape[-1]))
+    parents = [_parents(targets, k) for k in range(num_structures)]
+    for i in range(num_objects):
+        block = random_starts(rng, guesses.z[i], guesses.has[i], host.period, num)
+        for k, parent in enumerate(parents):
+            chosen = parent[np.arange(num) % len(parent)]
+            is_new = host.in_use[k] & ~host.in_use[chosen]
+            draws[i, k] = np.where(is_new, block, z[i, chosen])
+            draws[i, k, 0] = z[i, k]
+    return _best_draws(targets, draws, num_structures, settings.num_starts)
 
-    def one(key, target, best):
-        likelihood = target.log_likelihood
-        block = random_starts(key, likelihood.coordinates, likelihood.data, num)
-        num_slots = max(target.structures.shape[1], 1)
 
-        def starts(structure):
-            active = target.structures[structure]
-            slot = jnp.arange(num) % num_slots
-            smaller = active[None] & (
-                jnp.arange(active.shape[0])[None] != slot[:, None]
-            )
-            is_same = jnp.all(smaller[:, None] == target.structures[None], axis=-1)
-            parent = jnp.where(
-                jnp.any(is_same, axis=1), jnp.argmax(is_same, axis=1), structure
-            )
-            is_new = target.in_use(structure)[None] & ~jax.vmap(target.in_use)(parent)
-            z = jnp.where(is_new, block, best[parent])
-            return z.at[0].set(best[structure])
+def _parents(targets: StructureTarget, structure: int) -> np.ndarray:
+    """Structures with one slot less; the structure itself if there are none."""
+    structures = np.asarray(targets.structures[0])
+    active = structures[structure]
+    less = active[None] & ~np.eye(len(active), dtype=bool)[active]
+    found = np.flatnonzero((structures[:, None] == less[None]).all(-1).any(-1))
+    return found if found.size else np.array([structure])
 
-        return jax.vmap(starts)(jnp.arange(target.num_structures))
 
-    return jax.vmap(one)(keys, targets, best)
+def _best_draws(targets, draws: np.ndarray, num_structures: int, num: int) -> Fits:
+    num_objects, _, num_draws, dim = draws.shape
+    index = np.repeat(np.arange(num_objects), num_structures * num_draws)
+    structure = np.tile(np.repeat(np.arange(num_structures), num_draws), num_objects)
+    fits = make_fits(targets, index, structure, draws.reshape(-1, dim))
+    return best_of_each(fits, num_structures, num)
+
+
+def collect_modes(targets: StructureTarget, fits: Fits, num_modes: int) -> Modes:
+    """Distinct optima of every structure, padded to equal numbers."""
+    num_objects, num_structures = targets.structures.shape[:2]
+    host = Host.of(targets)
+    few = best_of_each(fits, num_structures, 2 * num_modes)
+    _, matrix = normal_equations(targets, host, few)
+    few = best_of_each(
+        few._replace(precision=matrix), num_structures, num_modes, min_distance=3.0
+    )
+    dim, total = few.z.shape[1], num_structures * num_modes
+    z = np.zeros((num_objects, total, dim))
+    precision = np.tile(np.eye(dim), (num_objects, total, 1, 1))
+    value = np.full((num_objects, total), -np.inf)
+    rank = np.zeros(len(few.value), int)
+    for row in range(1, len(rank)):
+        same = (
+            few.index[row] == few.index[row - 1]
+            and few.structure[row] == few.structure[row - 1]
+        )
+        rank[row] = rank[row - 1] + 1 if same else 0
+    place = few.structure * num_modes + rank
+    z[few.index, place] = few.z
+    precision[few.index, place] = few.precision
+    value[few.index, place] = few.value
+    structure = np.repeat(np.arange(num_structures), num_modes)
+    dtype = targets.log_prior.dtype
+    return Modes(
+        structure=jnp.broadcast_to(
+            jnp.asarray(structure, jnp.int32), (num_objects, total)
+        ),
+        z=jnp.asarray(z, dtype),
+        precision=jnp.asarray(precision, dtype),
+        log_density=jnp.asarray(value, dtype),
+    )

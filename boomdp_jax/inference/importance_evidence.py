@@ -10,12 +10,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.special import logsumexp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from boomdp_jax.core.arrays import FloatScalar, Key
 from boomdp_jax.inference.laplace_mixture import LaplaceMixture
-from boomdp_jax.inference.moves import Point, evaluate
-from boomdp_jax.inference.noise import draw_noise
+from boomdp_jax.inference.noise import Noise, draw_noise
 from boomdp_jax.inference.target import StructureTarget
 
 
@@ -40,6 +39,16 @@ class ImportanceEvidence(eqx.Module):
     """Normalised over all draws."""
 
 
+class ImportanceDraws(eqx.Module):
+    """Draws from a mixture, not yet weighed."""
+
+    structure: Int[Array, " draw"]
+    z: Float[Array, "draw dim"]
+    log_proposal: Float[Array, " draw"]
+    is_inside: Bool[Array, " draw"]
+    """False where a draw fell outside; it has no weight."""
+
+
 @eqx.filter_jit
 def importance_evidence(
     key: Key,
@@ -52,9 +61,37 @@ def importance_evidence(
 ) -> ImportanceEvidence:
     """Estimate the evidence of every structure.
 
-    Components are drawn systematically, in proportion to their weight, which never
-    does worse than drawing them independently; the stated errors are those of
-    independent draws.
+    Args:
+        key: random key.
+        target: the density.
+        mixture: where to draw from.
+        num_draws: draws of all structures together.
+        even_share: as in `importance_draws`.
+        chunk_size: likelihoods evaluated at once; bounds memory.
+
+    Returns:
+        The estimates. An effective sample size under some hundreds, or one far below
+        the number of draws, means that the mixture misses part of the posterior: the
+        errors are then too small as well.
+    """
+    draws = importance_draws(key, target, mixture, num_draws, even_share=even_share)
+    log_density = jax.lax.map(
+        lambda inputs: target.log_density(*inputs),
+        (draws.structure, draws.z),
+        batch_size=min(chunk_size, num_draws),
+    )
+    return weigh_draws(target, draws, log_density)
+
+
+def importance_draws(
+    key: Key,
+    target: StructureTarget,
+    mixture: LaplaceMixture,
+    num_draws: int,
+    *,
+    even_share: float = 0.5,
+) -> ImportanceDraws:
+    """Draw from a mixture, in proportion to the weights of its components.
 
     Args:
         key: random key.
@@ -63,37 +100,67 @@ def importance_evidence(
         num_draws: draws of all structures together.
         even_share: share of draws that is spread evenly over structures, so that the
             evidence of an improbable structure is known too.
-        chunk_size: likelihoods evaluated at once; bounds memory.
 
     Returns:
-        The estimates. An effective sample size under some hundreds, or one far below
-        the number of draws, means that the mixture misses part of the posterior: the
-        errors are then too small as well.
+        Draws, with the density that they were drawn from.
+    """
+    offset_key, draw_key = jax.random.split(key)
+    keys = jax.random.split(draw_key, num_draws)
+    noise = jax.vmap(
+        lambda key: draw_noise(key, target.dim, mixture.degrees_of_freedom)
+    )(keys)
+    offset = jax.random.uniform(offset_key)
+    return draws_of_noise(offset, noise, target, mixture, even_share=even_share)
+
+
+def draws_of_noise(
+    offset: FloatScalar,
+    noise: Noise,
+    target: StructureTarget,
+    mixture: LaplaceMixture,
+    *,
+    even_share: float = 0.5,
+) -> ImportanceDraws:
+    """The same from random numbers drawn already.
+
+    Components are drawn systematically, which never does worse than drawing them
+    independently; the errors that `weigh_draws` states are those of independent draws.
+
+    Args:
+        offset: uniform over (0, 1); shifts the choice of components.
+        noise: one of each draw.
+        target: the density.
+        mixture: where to draw from.
+        even_share: as in `importance_draws`.
     """
     mixture = _spread_evenly(target, mixture, even_share)
-    offset_key, draw_key = jax.random.split(key)
-    position = (jnp.arange(num_draws) + jax.random.uniform(offset_key)) / num_draws
+    num_draws = noise.choice.shape[0]
+    position = (jnp.arange(num_draws) + offset) / num_draws
     cumulative = jnp.cumsum(jnp.exp(mixture.log_weight))
     component = jnp.searchsorted(cumulative / cumulative[-1], position, side="right")
     component = jnp.minimum(component, mixture.num_components - 1)
 
-    def draw(inputs: tuple) -> Point:
-        key, component = inputs
-        noise = draw_noise(key, target.dim, mixture.degrees_of_freedom)
+    def draw(noise: Noise, component: Int[Array, ""]) -> ImportanceDraws:
         drawn = mixture.sample_component(noise, target, component)
-        return evaluate(target, mixture, drawn.structure, drawn.z, drawn.is_inside)
+        log_proposal = mixture.log_density(target, drawn.structure, drawn.z)
+        return ImportanceDraws(drawn.structure, drawn.z, log_proposal, drawn.is_inside)
 
-    points = jax.lax.map(
-        draw,
-        (jax.random.split(draw_key, num_draws), component),
-        batch_size=min(chunk_size, num_draws),
-    )
-    log_weight = points.log_density - points.log_proposal
+    return jax.vmap(draw)(noise, component)
+
+
+def weigh_draws(
+    target: StructureTarget, draws: ImportanceDraws, log_density: Float[Array, " draw"]
+) -> ImportanceEvidence:
+    """Turn draws and the target's log-density there into evidence and probabilities."""
+    num_draws = draws.structure.shape[0]
+    is_possible = draws.is_inside & (log_density < jnp.inf)
+    log_density = jnp.where(is_possible, log_density, -jnp.inf)
+    log_weight = log_density - draws.log_proposal
     log_weight = jnp.where(jnp.isnan(log_weight), -jnp.inf, log_weight)
     total = logsumexp(log_weight)
     normalised = log_weight - jnp.where(jnp.isfinite(total), total, 0.0)
     weight = jnp.exp(normalised)
-    is_of = points.structure[None] == jnp.arange(target.num_structures)[:, None]
+    is_of = draws.structure[None] == jnp.arange(target.num_structures)[:, None]
     weights = jnp.where(is_of, weight[None], 0.0)
     probability = jnp.sum(weights, axis=-1)
     square = jnp.sum(weights**2, axis=-1)
@@ -110,9 +177,9 @@ def importance_evidence(
         probability_error=jnp.sqrt(jnp.sum(deviation**2, axis=-1)),
         effective_sample_size=1.0 / jnp.sum(weight**2),
         structure_sample_size=size,
-        structure=points.structure,
-        z=points.z,
-        log_density=points.log_density,
+        structure=draws.structure,
+        z=draws.z,
+        log_density=log_density,
         log_weight=normalised,
     )
 

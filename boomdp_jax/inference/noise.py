@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from boomdp_jax.core.arrays import FloatScalar, IntScalar, Key
@@ -51,6 +52,40 @@ def draw_noise(key: Key, dim: int, degrees_of_freedom: int) -> Noise:
         normal=_to_normal(normal),
         square=_to_normal(square) ** 2,
     )
+
+
+def host_generator(key: Key) -> np.random.Generator:
+    """A generator on the host that follows from a key.
+
+    Batches of random numbers for compiled programs are drawn on the host where they are
+    small beside the work: a program that draws its own takes seconds longer to compile.
+    """
+    return np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel())
+
+
+def host_noise(
+    rng: np.random.Generator,
+    shape: tuple[int, ...],
+    dim: int,
+    degrees_of_freedom: int,
+    dtype: np.dtype,
+) -> Noise:
+    """The same as `draw_noise`, for a batch of proposals, drawn on the host."""
+
+    def normal(num: int) -> Array:
+        return jnp.asarray(rng.standard_normal((*shape, num)), dtype)
+
+    return Noise(
+        choice=jnp.asarray(_open_unit(rng, (*shape, NUM_CHOICES)), dtype),
+        turn=jnp.asarray(_open_unit(rng, (*shape, dim)) - 0.5, dtype),
+        normal=normal(dim),
+        square=normal(degrees_of_freedom + dim) ** 2,
+    )
+
+
+def _open_unit(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Uniform over (0, 1), so that single precision reaches neither end."""
+    return np.clip(rng.random(shape), 1e-7, 1.0 - 1e-7)
 
 
 def pick(log_weight: Float[Array, " option"], uniform: FloatScalar) -> Int[Array, ""]:

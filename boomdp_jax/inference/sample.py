@@ -11,17 +11,22 @@ from jaxtyping import Array, Float, Int
 
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics, diagnose_chains
-from boomdp_jax.inference.fit import FitSettings, evaluate_points, fit_modes
-from boomdp_jax.inference.importance_evidence import importance_evidence
-from boomdp_jax.inference.laplace_mixture import LaplaceMixture
+from boomdp_jax.inference.evaluate import evaluate_points
+from boomdp_jax.inference.find_modes import Found, find_modes
+from boomdp_jax.inference.fit import FitSettings
 from boomdp_jax.inference.mixture_building import (
     add_prior_components,
     add_slot_components,
     laplace_mixture,
-    refine_weights,
 )
-from boomdp_jax.inference.one_step import NoiseStatistics, draw_noise
-from boomdp_jax.inference.structure_chain import ChainDraws, RunInfo, run_chains
+from boomdp_jax.inference.noise import host_generator
+from boomdp_jax.inference.one_step import NOISE_SHAPE
+from boomdp_jax.inference.population import (
+    MoveCounts,
+    Population,
+    PopulationSettings,
+    sample_population,
+)
 from boomdp_jax.inference.target import StructureTarget
 
 
@@ -32,7 +37,21 @@ class SampleSettings(NamedTuple):
     num_warmup: int = 200
     num_samples: int = 500
     num_importance: int = 2048
+    num_walkers: int = 64
+    """Of each chain, at most as many as draws."""
     fit: FitSettings = FitSettings()
+
+    @property
+    def population(self) -> PopulationSettings:
+        """The same in sweeps of all walkers; at least as many draws as asked for."""
+        num_walkers = min(self.num_walkers, self.num_samples)
+        return PopulationSettings(
+            num_chains=self.num_chains,
+            num_walkers=num_walkers,
+            num_warmup=-(-self.num_warmup // num_walkers),
+            num_sweeps=-(-self.num_samples // num_walkers),
+            num_importance=max(self.num_importance, self.num_chains * num_walkers),
+        )
 
 
 class BlockDraws(NamedTuple):
@@ -52,41 +71,17 @@ class BlockDraws(NamedTuple):
 
 
 @eqx.filter_jit
-def _mixtures(key: Key, targets: StructureTarget, modes, num_draws: int):
-    """Proposal mixtures with importance-refined weights, and the evidence."""
+def _mixtures(targets: StructureTarget, modes):
+    """Proposal mixtures: fitted modes, modes times priors, and the prior."""
 
-    def one(key, target, modes):
+    def one(target, modes):
         mixture = laplace_mixture(
             target, modes.structure, modes.z, modes.precision, modes.log_density
         )
         mixture = add_slot_components(target, mixture, total_weight=0.4)
-        mixture = add_prior_components(target, mixture, total_weight=0.02)
-        evidence = importance_evidence(key, target, mixture, num_draws)
-        refined = refine_weights(
-            target, mixture, evidence.structure, evidence.z, evidence.log_weight
-        )
-        return refined, evidence
+        return add_prior_components(target, mixture, total_weight=0.02)
 
-    keys = jax.random.split(key, targets.structures.shape[0])
-    return jax.vmap(one)(keys, targets, modes)
-
-
-@eqx.filter_jit
-def _chains(
-    key: Key, targets: StructureTarget, mixtures: LaplaceMixture, settings: tuple
-) -> tuple[ChainDraws, RunInfo]:
-    num_chains, num_warmup, num_samples = settings
-    keys = jax.random.split(key, targets.structures.shape[0])
-    return jax.vmap(
-        lambda key, target, mixture: run_chains(
-            key,
-            target,
-            mixture,
-            num_chains=num_chains,
-            num_warmup=num_warmup,
-            num_samples=num_samples,
-        )
-    )(keys, targets, mixtures)
+    return jax.vmap(one)(targets, modes)
 
 
 def sample_blocks(
@@ -99,66 +94,69 @@ def sample_blocks(
 
     Args:
         key: random key.
-        targets: with a `OneStepLikelihood`, stacked along a leading object axis.
+        targets: with a `FilteredLikelihood`, stacked along a leading object axis.
         settings: how much to draw.
         report: called with the name of each stage as it begins.
 
     Returns:
         Draws of all chains one after the other, noise drawn given each.
     """
-    fit_key, importance_key, chain_key, noise_key = jax.random.split(key, 4)
-    report("fitting every structure")
-    modes = fit_modes(fit_key, targets, settings.fit)
-    report("weighing structures")
-    mixtures, evidence = _mixtures(
-        importance_key, targets, modes, settings.num_importance
-    )
+    fit_key, chain_key, noise_key = jax.random.split(key, 3)
+    found: Found = find_modes(fit_key, targets, settings.fit, report)
+    targets = found.targets
     report("jumping between structures")
-    draws, info = _chains(chain_key, targets, mixtures, settings[:3])
+    mixtures = _mixtures(targets, found.modes)
+    population = sample_population(chain_key, targets, mixtures, settings.population)
+    draws, evidence = population.draws, population.evidence
     num_objects = targets.structures.shape[0]
     structure = draws.structure.reshape(num_objects, -1)
     z = draws.z.reshape(*structure.shape, -1)
-    noise_scale = _noise(noise_key, targets, structure, z, settings.fit)
-    diagnostics = [
-        diagnose_chains(
-            jax.tree.map(lambda leaf, i=i: leaf[i], targets),
-            jax.tree.map(lambda leaf, i=i: leaf[i], draws),
-            jax.tree.map(lambda leaf, i=i: leaf[i], info),
-        )
-        for i in range(num_objects)
-    ]
-    log_prior = targets.log_prior
     return BlockDraws(
         structure=structure,
         z=z,
         log_density=draws.log_density.reshape(structure.shape),
-        noise_scale=noise_scale,
-        log_evidence=jax.nn.logsumexp(evidence.log_evidence + log_prior, axis=-1),
+        noise_scale=_noise(noise_key, targets, structure, z),
+        log_evidence=jax.nn.logsumexp(
+            evidence.log_evidence + targets.log_prior, axis=-1
+        ),
         importance_probability=evidence.probability,
         importance_size=evidence.effective_sample_size,
-        diagnostics=diagnostics,
+        diagnostics=[_diagnose(targets, population, i) for i in range(num_objects)],
         chain_index=np.arange(settings.num_chains),
     )
 
 
-def _noise(key, targets: StructureTarget, structure, z, settings: FitSettings):
-    """Noise scales given every draw; in chunks that reuse the fit's program."""
+def _diagnose(
+    targets: StructureTarget, population: Population, index: int
+) -> ChainDiagnostics:
+    """Judge one object."""
+
+    def pick(tree):
+        return jax.tree.map(lambda leaf: leaf[index], tree)
+
+    counts = population.counts
+    return diagnose_chains(
+        pick(targets),
+        pick(population.draws),
+        MoveCounts(counts.proposed[index][None], counts.accepted[index][None]),
+    )
+
+
+def _noise(key: Key, targets: StructureTarget, structure, z) -> Array:
+    """Noise scales given every draw, from their inverse-gamma distribution."""
     num_objects, num_draws = structure.shape
-    chunk = targets.structures.shape[1] * settings.num_draws
-    squares, counts = [], None
-    for start in range(0, num_draws, chunk):
-        rows = np.minimum(np.arange(start, start + chunk), num_draws - 1)
-        _, statistics = evaluate_points(targets, structure[:, rows], z[:, rows])
-        squares.append(statistics.square)
-        counts = statistics.num[:, :1]
-    square = jnp.concatenate(squares, axis=1)[:, :num_draws]
+    index = np.repeat(np.arange(num_objects), num_draws)
+    found = evaluate_points(
+        targets,
+        index,
+        np.asarray(structure).reshape(-1),
+        np.asarray(z).reshape(num_objects * num_draws, -1),
+    )
     likelihood: Any = targets.log_likelihood
-    scale = likelihood.coordinates.scales.noise
-
-    def draw(key, square, num, scale):
-        keys = jax.random.split(key, square.shape[0])
-        return jax.vmap(lambda k, s: draw_noise(k, NoiseStatistics(num[0], s), scale))(
-            keys, square
-        )
-
-    return jax.vmap(draw)(jax.random.split(key, num_objects), square, counts, scale)
+    reference = np.asarray(likelihood.reference, float)
+    scale = np.asarray(likelihood.coordinates.scales.noise, float)[:, None] / reference
+    shape = NOISE_SHAPE + 0.5 * found.num
+    rate = scale[index] ** 2 + 0.5 * found.square
+    draws = host_generator(key).gamma(shape)
+    sd = reference[index] * np.sqrt(rate / draws)
+    return jnp.asarray(sd, z.dtype).reshape(num_objects, num_draws, *sd.shape[1:])

@@ -1,7 +1,7 @@
 """First guesses from linear least squares: where pins and axles would have to be."""
 
-import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.inference.coordinates import Coordinates
@@ -154,16 +154,26 @@ def _wheel_seed(coordinates: Coordinates, data: Readings, slot: SlotKey):
 
 
 def random_starts(
-    key, coordinates: Coordinates, data: Readings, num: int
-) -> Float[Array, "start dim"]:
-    """Draws from the prior, in half of which guesses take the place of draws."""
-    normal_key, angle_key, jitter_key = jax.random.split(key, 3)
-    dim = coordinates.layout.dim
-    period = jnp.asarray(coordinates.layout.period())
-    normal = jax.random.normal(normal_key, (num, dim))
-    angle = period[None] * (jax.random.uniform(angle_key, (num, dim)) - 0.5)
-    z = jnp.where((period > 0)[None], angle, normal)
-    guess, has = seed_coordinates(coordinates, data)
-    jitter = guess[None] + 0.02 * jax.random.normal(jitter_key, (num, dim))
-    use = has[None] & (jnp.arange(num) % 2 == 0)[:, None]
-    return jnp.where(use, jitter, z)
+    rng: np.random.Generator,
+    guess: Float[np.ndarray, " dim"],
+    has: Bool[np.ndarray, " dim"],
+    period: Float[np.ndarray, " dim"],
+    num: int,
+) -> Float[np.ndarray, "start dim"]:
+    """Draws from the prior, in half of which guesses take the place of draws.
+
+    Args:
+        rng: source of randomness.
+        guess: of `seed_coordinates`.
+        has: which coordinates have a guess.
+        period: of coordinates that are angles, 0 for all others.
+        num: how many.
+
+    Returns:
+        The starts.
+    """
+    shape = (num, len(guess))
+    angle = period * (rng.random(shape) - 0.5)
+    z = np.where(period > 0, angle, rng.standard_normal(shape))
+    jitter = guess + 0.02 * rng.standard_normal(shape)
+    return np.where(has & (np.arange(num) % 2 == 0)[:, None], jitter, z)

@@ -1,0 +1,128 @@
+"""Likelihoods of many points of many objects, by one compiled program.
+
+Points come as a flat list on the host. They are sorted into chunks of equal object and
+structure, so that data and gains are read once for a chunk and products with gains
+vectorise, and handed out in calls of one size: whatever is fitted, weighed or sampled,
+and however many objects there are, the physics is compiled once.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from boomdp_jax.inference.target import StructureTarget
+
+_CHUNK = 32
+_CHUNKS_PER_CALL = 16
+
+
+class Evaluation(NamedTuple):
+    """What is known of each point; leading axis `point`, on the host."""
+
+    log_density: np.ndarray
+    """Prior included; minus infinity where the prediction is not finite."""
+    num: np.ndarray
+    square: np.ndarray
+    """Counts and sums of squared innovations, `[point, body, 4]`."""
+    innovation: np.ndarray | None
+    """Whitened innovations, `[point, reading]`."""
+
+
+@eqx.filter_jit
+def _evaluate_chunks(targets: StructureTarget, index, structure, z):
+    """Chunks `[chunk, point, dim]`, each of one object and structure."""
+
+    def one_chunk(i, k, z):
+        target = jax.tree.map(lambda leaf: leaf[i], targets)
+        likelihood: Any = target.log_likelihood
+        gains = likelihood.gains_of(k)
+        log_volume = gains.log_volume
+
+        def one_point(z):
+            found = likelihood.innovations(z, target.structures[k], gains)
+            value = likelihood.log_marginal(found.statistics, log_volume)
+            return (
+                target.log_prior_density(k, z) + value,
+                found.statistics,
+                found.whitened.reshape(-1),
+            )
+
+        return jax.vmap(one_point)(z)
+
+    return jax.vmap(one_chunk)(index, structure, z)
+
+
+def evaluate_points(
+    targets: StructureTarget,
+    index: np.ndarray,
+    structure: np.ndarray,
+    z: np.ndarray,
+    *,
+    with_innovations: bool = False,
+) -> Evaluation:
+    """Log-densities and noise statistics of a list of points.
+
+    Args:
+        targets: with a `FilteredLikelihood`, stacked along a leading object axis.
+        index: object of each point.
+        structure: of each point.
+        z: coordinates of each point, `[point, dim]`.
+        with_innovations: whether to bring back the innovations, for a fit.
+
+    Returns:
+        One row per point, in the order given.
+    """
+    num_points = z.shape[0]
+    num_structures = targets.structures.shape[1]
+    group = index.astype(np.int64) * num_structures + structure
+    order = np.argsort(group, kind="stable")
+    names, begins, sizes = np.unique(
+        group[order], return_index=True, return_counts=True
+    )
+    num_chunks = -(-sizes // _CHUNK)
+    total = int(num_chunks.sum())
+    num_calls = -(-total // _CHUNKS_PER_CALL)
+    padded = num_calls * _CHUNKS_PER_CALL
+    # Which point fills each place; places left over repeat their group's first point.
+    source = np.zeros((padded, _CHUNK), np.int64)
+    owner = np.zeros(padded, np.int64)
+    first = 0
+    for name, begin, size, count in zip(names, begins, sizes, num_chunks, strict=True):
+        places = np.full(count * _CHUNK, order[begin])
+        places[:size] = order[begin : begin + size]
+        source[first : first + count] = places.reshape(count, _CHUNK)
+        owner[first : first + count] = name
+        first += count
+    if first:
+        source[first:], owner[first:] = source[0, 0], owner[0]
+    dtype = np.dtype(targets.log_prior.dtype)
+    calls = []
+    for number in range(num_calls):
+        rows = slice(number * _CHUNKS_PER_CALL, (number + 1) * _CHUNKS_PER_CALL)
+        calls.append(
+            _evaluate_chunks(
+                targets,
+                jnp.asarray(owner[rows] // num_structures, jnp.int32),
+                jnp.asarray(owner[rows] % num_structures, jnp.int32),
+                jnp.asarray(z[source[rows]], dtype),
+            )
+        )
+    flat = source[:total].reshape(-1)
+
+    def gather(pick):
+        parts = [np.asarray(pick(call)) for call in calls]
+        joined = np.concatenate(parts).reshape(-1, *parts[0].shape[2:])[: flat.size]
+        out = np.empty((num_points, *joined.shape[1:]), joined.dtype)
+        out[flat] = joined
+        return out
+
+    log_density = gather(lambda call: call[0])
+    return Evaluation(
+        log_density=np.where(log_density > -1e29, log_density, -np.inf),
+        num=gather(lambda call: call[1].num),
+        square=gather(lambda call: call[1].square),
+        innovation=gather(lambda call: call[2]) if with_innovations else None,
+    )

@@ -1,0 +1,98 @@
+r"""Likelihood of noisy readings with latent states, noise scales integrated out.
+
+The innovations of a filter with fixed gains (`tracking`) are whitened by the noise that
+the gains were made for. Per body and channel group the true noise is that times an
+unknown factor c, whose square has the inverse-gamma prior that the noise's own prior
+implies, and is integrated out. Gains depend on the ratios of the noises only, which
+this takes as known.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from boomdp_jax.core.arrays import FloatScalar, IntScalar
+from boomdp_jax.inference.coordinates import Coordinates
+from boomdp_jax.inference.one_step import NoiseStatistics, log_marginal
+from boomdp_jax.inference.track_data import TrackData
+from boomdp_jax.inference.tracking import Gains, innovations
+
+_CHANNEL_GROUPS = ((0, 1), (2,), (3, 4), (5,))
+
+
+class Innovations(NamedTuple):
+    """What a hypothesis leaves unexplained."""
+
+    whitened: Float[Array, "time 2 body 6"]
+    statistics: NoiseStatistics
+
+
+class FilteredLikelihood(eqx.Module):
+    """Log-likelihood of coordinates and active slots; what samplers call."""
+
+    coordinates: Coordinates
+    data: TrackData
+    structures: Bool[Array, "structure slot"]
+    gains: Gains
+    """With a leading structure axis."""
+    reference: Float[Array, "body 4"]
+    """Noise that the gains were made for."""
+
+    def __call__(
+        self, z: Float[Array, " dim"], active: Bool[Array, " slot"]
+    ) -> FloatScalar:
+        """Log marginal likelihood, -1e30 where the prediction is not finite."""
+        structure = self.structure_index(active)
+        gains = self.gains_of(structure)
+        found = self.innovations(z, active, gains)
+        return self.log_marginal(found.statistics, gains.log_volume)
+
+    def structure_index(self, active: Bool[Array, " slot"]) -> IntScalar:
+        """Which structure has these slots active."""
+        same = jnp.all(self.structures == active[None], axis=-1)
+        return jnp.argmax(same).astype(jnp.int32)
+
+    def gains_of(self, structure: Int[Array, "*batch"]) -> Gains:
+        """Gains of a structure, or of several."""
+        return jax.tree.map(lambda leaf: leaf[structure], self.gains)
+
+    def innovations(
+        self, z: Float[Array, " dim"], active: Bool[Array, " slot"], gains: Gains
+    ) -> Innovations:
+        """Whitened innovations at a hypothesis, and their sums of squares."""
+        params = self.coordinates(z, active)
+        whitened = innovations(self.coordinates.scene, params, self.data, gains)
+        num_bodies = whitened.shape[-2]
+        counts = gains.counts.reshape(-1, 2, num_bodies, 6)
+        return Innovations(
+            whitened,
+            NoiseStatistics(_group_sums(counts), _group_sums(whitened**2)),
+        )
+
+    def log_marginal(
+        self, statistics: NoiseStatistics, log_volume: FloatScalar
+    ) -> FloatScalar:
+        """The same from statistics."""
+        each = jax.vmap(
+            lambda num, square, scale: log_marginal(
+                NoiseStatistics(num[None], square[None]), scale
+            )
+        )(statistics.num, statistics.square, self.relative_scale)
+        value = jnp.sum(each) + log_volume
+        return jnp.where(jnp.isfinite(value), value, -1e30)
+
+    @property
+    def relative_scale(self) -> Float[Array, "body 4"]:
+        """Prior scale of the factor by which the noise differs from the reference."""
+        return self.coordinates.scales.noise[None] / self.reference
+
+
+def _group_sums(values: Float[Array, "time 2 body 6"]) -> Float[Array, "body 4"]:
+    """Sum over readings and over the channels of each group."""
+    total = jnp.sum(values, axis=(0, 1))
+    return jnp.stack(
+        [sum(total[:, c] for c in group) for group in _CHANNEL_GROUPS], axis=-1
+    )

@@ -1,0 +1,106 @@
+"""Modes of every structure of noisy recordings, and the filter that they belong to.
+
+A filter's gains follow from a hypothesis and from the noise; the best hypothesis
+follows from the gains. So: fit single steps; then, a few times over, fit the noise at
+the best hypothesis, give every structure the gains of its own best fit, and fit again.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from boomdp_jax.core.arrays import Key
+from boomdp_jax.inference.fit import (
+    Fits,
+    FitSettings,
+    Guesses,
+    Modes,
+    best_of_each,
+    climb,
+    collect_modes,
+    first_fits,
+    grown_fits,
+    join_fits,
+    make_fits,
+)
+from boomdp_jax.inference.fit_noise import NoiseFit, fit_noise, with_gains
+from boomdp_jax.inference.noise import host_generator
+from boomdp_jax.inference.target import StructureTarget
+
+# Rounds of noise, gains and fit.
+_NUM_ROUNDS = 2
+# Noise starts too high rather than too low, in units of the prior's scale, and the
+# impulses at the prior's scale of velocity readings.
+_START_NOISE = 5.0
+
+
+class Found(NamedTuple):
+    """Modes, and the targets whose modes they are."""
+
+    targets: StructureTarget
+    modes: Modes
+    noise: NoiseFit
+
+
+def find_modes(
+    key: Key,
+    targets: StructureTarget,
+    settings: FitSettings,
+    report: Callable[[str], None] = lambda stage: None,
+) -> Found:
+    """Fit every structure of many objects; keep distinct optima.
+
+    Args:
+        key: source of starts.
+        targets: with the one-step gains that `make_block` sets, stacked along a leading
+            object axis.
+        settings: how hard to look.
+        report: called with the name of each stage as it begins.
+
+    Returns:
+        Targets with the gains of filters, and up to `num_modes` modes per structure.
+    """
+    num_structures = targets.structures.shape[1]
+    rng = host_generator(key)
+    guesses = Guesses.of(targets)
+    report("fitting single steps")
+    fits = climb(
+        targets, first_fits(rng, targets, guesses, settings), settings.num_iterations
+    )
+    grown = grown_fits(rng, targets, guesses, fits, settings)
+    fits = join_fits(fits, climb(targets, grown, settings.num_iterations))
+    likelihood: Any = targets.log_likelihood
+    scale = np.asarray(likelihood.coordinates.scales.noise, float)
+    num_bodies = likelihood.reference.shape[1]
+    reading = np.repeat(_START_NOISE * scale[:, None], num_bodies, axis=1)
+    noise = NoiseFit(reading, np.repeat(scale[:, None, 2:], num_bodies, axis=1))
+    for number in range(_NUM_ROUNDS):
+        report(f"fitting noise and filters, round {number + 1} of {_NUM_ROUNDS}")
+        top = best_of_each(fits, num_structures, 1)
+        noise = fit_noise(targets, _champions(targets, top), noise)
+        targets = with_gains(targets, top, noise)
+        again = make_fits(targets, fits.index, fits.structure, fits.z)
+        again = best_of_each(again, num_structures, settings.num_starts)
+        fits = climb(targets, again, settings.num_iterations)
+        grown = grown_fits(rng, targets, guesses, fits, settings)
+        fits = join_fits(fits, climb(targets, grown, settings.num_iterations))
+    return Found(targets, collect_modes(targets, fits, settings.num_modes), noise)
+
+
+def _champions(targets: StructureTarget, top: Fits) -> Fits:
+    """The most probable structure's best fit of every object, by Laplace's evidence."""
+    num_objects, num_structures = targets.structures.shape[:2]
+    sign, log_volume = np.linalg.slogdet(top.precision)
+    evidence = np.where(sign > 0, top.value - 0.5 * log_volume, -np.inf)
+    evidence = evidence + 0.5 * np.log(2.0 * np.pi) * _num_used(targets)[top.structure]
+    best = np.argmax(evidence.reshape(num_objects, num_structures), axis=1)
+    return top.take(np.arange(num_objects) * num_structures + best)
+
+
+def _num_used(targets: StructureTarget) -> np.ndarray:
+    """How many coordinates each structure uses."""
+    structures, slot = np.asarray(targets.structures[0]), np.asarray(targets.slot[0])
+    always = np.sum(slot < 0)
+    each = np.bincount(slot[slot >= 0], minlength=structures.shape[1])
+    return always + structures @ each

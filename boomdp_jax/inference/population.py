@@ -1,0 +1,324 @@
+"""Many walkers over structures and coordinates, moved together.
+
+Each chain is a population of walkers. It starts at draws of its own from the fitted
+mixture, resampled by importance, and all of its walkers then make the same cycle of
+moves as a single chain would (`moves`): jumps, local changes, walks, each accepted with
+its exact ratio. A move of all walkers of all chains of all objects is one batch of
+likelihoods. Chains share nothing, so that R-hat across them tells what importance
+weights and moves together have not evened out (Margossian et al. 2024, Nested R-hat).
+
+Prefer this to `structure_chain.run_chains` where a likelihood is far cheaper in a batch
+than alone.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from boomdp_jax.core.arrays import Key
+from boomdp_jax.inference.evaluate import evaluate_points
+from boomdp_jax.inference.importance_evidence import (
+    ImportanceEvidence,
+    draws_of_noise,
+    weigh_draws,
+)
+from boomdp_jax.inference.laplace_mixture import LaplaceMixture
+from boomdp_jax.inference.mixture_building import refine_weights
+from boomdp_jax.inference.moves import (
+    MOVES,
+    MoveInfo,
+    Point,
+    Proposal,
+    accept,
+    propose_change,
+    propose_walk,
+)
+from boomdp_jax.inference.noise import Noise, host_generator, host_noise, pick
+from boomdp_jax.inference.structure_chain import ChainDraws
+from boomdp_jax.inference.target import StructureTarget
+
+# Moves of one sweep, by name.
+_CYCLE = ("jump", "walk", "change", "walk", "jump")
+_PRIOR_SHARE = 0.3
+_WALK_ACCEPT = 0.4
+
+
+class PopulationSettings(NamedTuple):
+    """How many walkers make how many sweeps."""
+
+    num_chains: int = 4
+    num_walkers: int = 64
+    """Of each chain."""
+    num_warmup: int = 4
+    """Sweeps that adapt the walk's step size and are thrown away."""
+    num_sweeps: int = 8
+    """Sweeps that are kept; each gives one draw per walker."""
+    num_importance: int = 2048
+    """Draws from the mixture that refine its weights; and again, that are weighed."""
+
+
+class MoveCounts(NamedTuple):
+    """Proposals made and accepted, `[object, move, 2]`; see `structure_chain`."""
+
+    proposed: np.ndarray
+    accepted: np.ndarray
+
+
+class Population(NamedTuple):
+    """Draws of all objects, and what the mixture was worth."""
+
+    draws: ChainDraws
+    """`[object, chain, draw]`; the draws of one walker follow each other."""
+    counts: MoveCounts
+    evidence: ImportanceEvidence
+    """With a leading object axis."""
+
+
+def sample_population(
+    key: Key,
+    targets: StructureTarget,
+    mixtures: LaplaceMixture,
+    settings: PopulationSettings,
+) -> Population:
+    """Draw from the posteriors of a batch of objects.
+
+    Args:
+        key: random key.
+        targets: with a `FilteredLikelihood`, stacked along a leading object axis.
+        mixtures: one of each object.
+        settings: how much to draw.
+
+    Returns:
+        Draws of every chain, move counts, and evidence by importance sampling.
+    """
+    rng = host_generator(key)
+    evidence = _weigh(rng, targets, mixtures, settings.num_importance)
+    mixtures = _refine(targets, mixtures, evidence)
+    evidence = _weigh(rng, targets, mixtures, settings.num_importance)
+    points = _start(evidence, targets, mixtures, settings)
+    num_objects = targets.structures.shape[0]
+    step_size = np.full(num_objects, 0.5)
+    shape = (num_objects, len(MOVES), 2)
+    proposed, accepted = np.zeros(shape, int), np.zeros(shape, int)
+    kept = []
+    for sweep in range(settings.num_warmup + settings.num_sweeps):
+        is_warm_up = sweep < settings.num_warmup
+        for move in _CYCLE:
+            points, info = _move(move, rng, points, targets, mixtures, step_size)
+            if move == "walk" and is_warm_up:
+                rate = np.asarray(jnp.mean(info.accept_probability, axis=1), float)
+                step_size = np.clip(step_size * np.exp(rate - _WALK_ACCEPT), 0.02, 0.98)
+            if not is_warm_up:
+                _count(proposed, accepted, MOVES.index(move), info)
+        if not is_warm_up:
+            kept.append(points)
+    return Population(
+        draws=_arrange(kept, settings),
+        counts=MoveCounts(proposed, accepted),
+        evidence=evidence,
+    )
+
+
+@eqx.filter_jit
+def _draw(offset, noise, targets: StructureTarget, mixtures: LaplaceMixture):
+    return jax.vmap(draws_of_noise)(offset, noise, targets, mixtures)
+
+
+@eqx.filter_jit
+def _weigh_all(targets: StructureTarget, draws, log_density):
+    return jax.vmap(weigh_draws)(targets, draws, log_density)
+
+
+def _weigh(
+    rng: np.random.Generator,
+    targets: StructureTarget,
+    mixtures: LaplaceMixture,
+    num_draws: int,
+) -> ImportanceEvidence:
+    """Draw from mixtures and weigh the draws."""
+    num_objects = targets.structures.shape[0]
+    noise = _noise(rng, targets, mixtures, num_draws)
+    offset = jnp.asarray(rng.random(num_objects), noise.normal.dtype)
+    draws = _draw(offset, noise, targets, mixtures)
+    return _weigh_all(targets, draws, _evaluate(targets, draws.structure, draws.z))
+
+
+def _noise(
+    rng: np.random.Generator,
+    targets: StructureTarget,
+    mixtures: LaplaceMixture,
+    num: int,
+) -> Noise:
+    """Random numbers for as many proposals of every object."""
+    num_objects, dim = targets.slot.shape
+    dtype = np.dtype(targets.log_prior.dtype)
+    return host_noise(rng, (num_objects, num), dim, mixtures.degrees_of_freedom, dtype)
+
+
+def _evaluate(targets: StructureTarget, structure, z) -> Float[Array, "object point"]:
+    """Log-densities of as many points of every object."""
+    num_objects, num = structure.shape
+    found = evaluate_points(
+        targets,
+        np.repeat(np.arange(num_objects), num),
+        np.asarray(structure).reshape(-1),
+        np.asarray(z).reshape(num_objects * num, -1),
+    )
+    return jnp.asarray(found.log_density.reshape(num_objects, num))
+
+
+@eqx.filter_jit
+def _refine(targets: StructureTarget, mixtures: LaplaceMixture, evidence):
+    return jax.vmap(
+        lambda t, m, e: refine_weights(t, m, e.structure, e.z, e.log_weight)
+    )(targets, mixtures, evidence)
+
+
+def _start(
+    evidence: ImportanceEvidence,
+    targets: StructureTarget,
+    mixtures: LaplaceMixture,
+    settings: PopulationSettings,
+) -> Point:
+    """Resample walkers of each chain from its own share of the weighed draws.
+
+    Draws are dealt out in turn, so that systematically drawn components are shared
+    evenly. Resampling is systematic about the middle of each interval.
+    """
+    num_objects, num_draws = evidence.log_weight.shape
+    num_chains, num_walkers = settings.num_chains, settings.num_walkers
+    weight = np.exp(np.asarray(evidence.log_weight, float))
+    rows = np.zeros((num_objects, num_chains, num_walkers), int)
+    middle = (np.arange(num_walkers) + 0.5) / num_walkers
+    for i in range(num_objects):
+        for chain in range(num_chains):
+            mine = np.arange(chain, num_draws, num_chains)
+            total = np.cumsum(weight[i, mine])
+            if total[-1] > 0:
+                place = np.searchsorted(total / total[-1], middle, side="right")
+            else:
+                place = np.arange(num_walkers)
+            rows[i, chain] = mine[np.minimum(place, len(mine) - 1)]
+    rows = rows.reshape(num_objects, -1)
+    each = np.arange(num_objects)[:, None]
+    structure = evidence.structure[each, rows]
+    z = evidence.z[each, rows]
+    return Point(
+        structure=structure,
+        z=z,
+        log_density=evidence.log_density[each, rows],
+        log_proposal=_log_proposal(targets, mixtures, structure, z),
+    )
+
+
+@eqx.filter_jit
+def _log_proposal(targets, mixtures, structure, z):
+    def one(target, mixture, structure, z):
+        return jax.vmap(lambda k, z: mixture.log_density(target, k, z))(structure, z)
+
+    return jax.vmap(one)(targets, mixtures, structure, z)
+
+
+class _Batch(NamedTuple):
+    """A proposal of every walker, before its likelihood is known."""
+
+    proposal: Proposal
+    log_proposal: Float[Array, "object walker"]
+
+
+@eqx.filter_jit
+def _propose(
+    move: str,
+    noise: Noise,
+    points: Point,
+    targets: StructureTarget,
+    mixtures: LaplaceMixture,
+    step_size: Float[Array, " object"],
+) -> _Batch:
+    def one(noise, point, target, mixture, step_size):
+        if move == "walk":
+            proposal = propose_walk(noise, point, target, mixture, step_size)
+        elif move == "change":
+            proposal = propose_change(noise, point, target, mixture, _PRIOR_SHARE)
+        else:
+            component = pick(mixture.log_weight, noise.choice[0])
+            draw = mixture.sample_component(noise, target, component)
+            proposal = Proposal(
+                structure=draw.structure,
+                z=draw.z,
+                log_correction=point.log_proposal,
+                is_valid=draw.is_inside,
+                is_made=jnp.asarray(True),
+            )
+        log_proposal = mixture.log_density(target, proposal.structure, proposal.z)
+        if move == "jump":
+            correction = proposal.log_correction - log_proposal
+            proposal = proposal._replace(log_correction=correction)
+        return _Batch(proposal, log_proposal)
+
+    over = jax.vmap(jax.vmap(one, (0, 0, None, None, None)))
+    return over(noise, points, targets, mixtures, step_size)
+
+
+@eqx.filter_jit
+def _decide(
+    points: Point, batch: _Batch, log_density, uniform
+) -> tuple[Point, MoveInfo]:
+    def one(point, batch, log_density, uniform):
+        proposal = batch.proposal
+        is_valid = proposal.is_valid & proposal.is_made & (log_density < jnp.inf)
+        candidate = Point(
+            structure=proposal.structure,
+            z=proposal.z,
+            log_density=jnp.where(is_valid, log_density, -jnp.inf),
+            log_proposal=batch.log_proposal,
+        )
+        moved, info = accept(uniform, point, candidate, proposal.log_correction)
+        return moved, info._replace(is_made=proposal.is_made)
+
+    return jax.vmap(jax.vmap(one))(points, batch, log_density, uniform)
+
+
+def _move(
+    move: str,
+    rng: np.random.Generator,
+    points: Point,
+    targets: StructureTarget,
+    mixtures: LaplaceMixture,
+    step_size: np.ndarray,
+) -> tuple[Point, MoveInfo]:
+    """One move of every walker."""
+    dtype = points.z.dtype
+    noise = _noise(rng, targets, mixtures, points.structure.shape[1])
+    size = jnp.asarray(step_size, dtype)
+    batch = _propose(move, noise, points, targets, mixtures, size)
+    proposal = batch.proposal
+    log_density = _evaluate(targets, proposal.structure, proposal.z).astype(dtype)
+    # Which choices a proposal makes is its own affair; the verdict gets a fresh number.
+    uniform = jnp.asarray(1.0 - rng.random(points.structure.shape), dtype)
+    return _decide(points, batch, log_density, uniform)
+
+
+def _count(proposed, accepted, index: int, info: MoveInfo) -> None:
+    is_made, is_taken = np.asarray(info.is_made), np.asarray(info.accepted)
+    changes = np.asarray(info.changes_structure)
+    for column, mask in enumerate((~changes, changes)):
+        proposed[:, index, column] += np.sum(is_made & mask, axis=1)
+        accepted[:, index, column] += np.sum(is_taken & mask, axis=1)
+
+
+def _arrange(kept: list[Point], settings: PopulationSettings) -> ChainDraws:
+    """Sweeps put together, walker after walker within each chain."""
+
+    def whole(name: str) -> Array:
+        stacked = jnp.stack([getattr(points, name) for points in kept], axis=2)
+        num_objects = stacked.shape[0]
+        shape = (num_objects, settings.num_chains, -1, *stacked.shape[3:])
+        return stacked.reshape(shape)
+
+    structure: Int[Array, "object chain draw"] = whole("structure")
+    return ChainDraws(structure, whole("z"), whole("log_density"))

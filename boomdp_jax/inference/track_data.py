@@ -1,0 +1,67 @@
+"""Readings in the order in which a filter takes them: start, second reading, next."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from boomdp_jax.core.history import History
+from boomdp_jax.inference.one_step import Readings, readings
+
+
+class TrackData(eqx.Module):
+    """What a filter needs of a history, for the bodies of one block.
+
+    A row either starts a track at its own first reading, or goes on from the row
+    before; then its first reading is either the very one that ended the row before, or
+    a second reading of the same instant.
+    """
+
+    steps: Readings
+    """The rows taken one by one; `steps.mask` counts those whose start is known."""
+    first_mask: Float[Array, "time body 6"]
+    """One where the first reading of a row was read."""
+    last_mask: Float[Array, "time body 6"]
+    """One where the last reading of a row was read."""
+    is_start: Float[Array, " time"]
+    is_second: Float[Array, " time"]
+    """One where the first reading is a second one of an instant already read."""
+    start: Float[Array, "time body 6"]
+    """Where a track would start in each row: readings, or a guess where missing."""
+
+
+def track_data(
+    history: History, bodies: tuple[int, ...], is_uniform: bool
+) -> TrackData:
+    """Take a block's bodies out of a history.
+
+    Args:
+        history: all of it.
+        bodies: indices of the block's bodies.
+        is_uniform: whether all steps are equally long.
+
+    Returns:
+        The readings. A missing first reading of a track is replaced by the mean
+        position, or by rest; how little is known of it is up to the filter.
+    """
+    index = jnp.asarray(bodies)
+    steps = readings(history, bodies, is_uniform)
+    dtype = steps.state.dtype
+    rows = history.mask
+    first = history.state_mask[:, index] & rows[:, None, None]
+    last = history.next_state_mask[:, index] & rows[:, None, None]
+    same = jnp.zeros(rows.shape, bool)
+    if rows.shape[0] > 1:
+        episode = history.episode
+        same = same.at[1:].set((episode[1:] == episode[:-1]) & rows[:-1])
+    goes_on = rows & same
+    num = jnp.maximum(jnp.sum(first, axis=0), 1)
+    mean = jnp.sum(jnp.where(first, steps.state, 0.0), axis=0) / num
+    guess = jnp.where(jnp.arange(6)[None] < 3, mean, 0.0)
+    return TrackData(
+        steps=steps,
+        first_mask=first.astype(dtype),
+        last_mask=last.astype(dtype),
+        is_start=(~goes_on).astype(dtype),
+        is_second=(goes_on & ~history.is_chained).astype(dtype),
+        start=jnp.where(first, steps.state, guess[None]),
+    )

@@ -1,0 +1,170 @@
+r"""A filter with gains fixed beforehand: what a hypothesis says of noisy readings.
+
+States are latent and every reading of them is noisy, the ones that a step starts from
+included. With $\hat x$ the best guess of a state given the readings so far,
+
+$$e_t = y_t - F_\Phi(\hat x_{t-1}, a_{t-1}), \qquad
+  \hat x_t = F_\Phi(\hat x_{t-1}, a_{t-1}) + K_t e_t, \qquad u_t = W_t e_t.$$
+
+Gains K and whitenings W (inverse Cholesky factors of the innovations' covariance) are
+those of an extended Kalman filter at the best fit of the same structure
+(`kalman.extended_filter`). Fixed, a hypothesis costs one step a row and a fit is
+least squares. With K = 1 for the reading that a step starts from and K = 0 for the one
+that it ends at, this is the one-step likelihood of "What Does Physics Bias".
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from boomdp_jax.core.arrays import FloatScalar
+from boomdp_jax.inference.track_data import TrackData
+from boomdp_jax.physics.params import Params
+from boomdp_jax.physics.scene import Scene
+from boomdp_jax.physics.state import state_from_array
+from boomdp_jax.physics.step import step
+
+# Largest number of channels for which products with gains are written out; beyond it
+# a library call costs less than the compilation of so many terms.
+_MAX_WRITTEN_OUT = 6
+
+
+class Gains(eqx.Module):
+    """What a filter does with the two readings of each row, worked out beforehand.
+
+    The last batch axis is time, in a table of all rows.
+
+    Rows and columns are channels, body by body; those of channels that were not read
+    are zero, and so is everything of a reading that does not count.
+    """
+
+    first: Float[Array, "*batch channel channel"]
+    """Gain of the reading that a row starts from; zero where a track starts."""
+    last: Float[Array, "*batch channel channel"]
+    first_whitening: Float[Array, "*batch channel channel"]
+    last_whitening: Float[Array, "*batch channel channel"]
+
+    @property
+    def counts(self) -> Float[Array, "*batch time 2 channel"]:
+        """One for each innovation that counts."""
+        both = jnp.stack([self.first_whitening, self.last_whitening], axis=-3)
+        diagonal = jnp.diagonal(both, axis1=-2, axis2=-1)
+        return (diagonal > 0).astype(both.dtype)
+
+    @property
+    def log_volume(self) -> Float[Array, "*batch"]:
+        """Log-determinant of all whitenings."""
+        both = jnp.stack([self.first_whitening, self.last_whitening], axis=-3)
+        diagonal = jnp.diagonal(both, axis1=-2, axis2=-1)
+        logs = jnp.log(jnp.where(diagonal > 0, diagonal, 1.0))
+        return jnp.sum(logs, axis=(-3, -2, -1))
+
+
+def one_step_gains(data: TrackData, scale: Float[Array, "body 6"]) -> Gains:
+    """Gains that believe every first reading and learn nothing from the last.
+
+    Args:
+        data: the readings.
+        scale: by which innovations are divided, per channel.
+
+    Returns:
+        Gains under which tracking is one-step prediction.
+    """
+    num_rows = data.first_mask.shape[0]
+    num = data.steps.state.shape[1] * 6
+    goes_on = (1.0 - data.is_start)[:, None, None]
+    identity = jnp.broadcast_to(jnp.eye(num), (num_rows, num, num))
+    counts = data.steps.mask.reshape(num_rows, num) / scale.reshape(-1)[None]
+    zero = jnp.zeros_like(identity)
+    return Gains(goes_on * identity, zero, zero, identity * counts[:, None, :])
+
+
+def channel_difference(
+    reading: Float[Array, "body 6"], state: Float[Array, "body 6"]
+) -> Float[Array, "body 6"]:
+    """Reading minus state, angles the shorter way round."""
+    difference = reading - state
+    angle = difference[:, 2]
+    turns = jax.lax.stop_gradient(jnp.round(angle / (2.0 * jnp.pi)))
+    return difference.at[:, 2].set(angle - 2.0 * jnp.pi * turns)
+
+
+def predict_state(
+    scene: Scene,
+    params: Params,
+    state: Float[Array, "body 6"],
+    action: Float[Array, "body 3"],
+    dt: FloatScalar,
+) -> Float[Array, "body 6"]:
+    """One step from channels to channels."""
+    return step(scene, params, state_from_array(state), action, dt=dt)[0].array
+
+
+def innovations(
+    scene: Scene, params: Params, data: TrackData, gains: Gains
+) -> Float[Array, "time 2 body 6"]:
+    """Whitened innovations of all readings, zero where nothing was read.
+
+    Args:
+        scene: the block's scene.
+        params: one hypothesis.
+        data: the block's readings.
+        gains: of the hypothesis's structure.
+
+    Returns:
+        Of the reading that a row starts from and of the one that it ends at;
+        independent and of unit variance if hypothesis, gains and noise are right.
+    """
+    steps = data.steps
+    shape = steps.state.shape[1:]
+
+    def correct(state, reading, mask, gain, whitening):
+        error = mask * channel_difference(reading, state)
+        moved = state + _apply(gain, error)
+        return moved, _apply(whitening, error, is_lower=True)
+
+    def advance(state, row):
+        is_start, start, first, first_mask, action, last, last_mask, dt, gain = row
+        state = jnp.where(is_start > 0, start, state)
+        state, first_error = correct(
+            state, first, first_mask, gain.first, gain.first_whitening
+        )
+        state = predict_state(scene, params, state, action, dt)
+        state, last_error = correct(
+            state, last, last_mask, gain.last, gain.last_whitening
+        )
+        return state, jnp.stack([first_error, last_error])
+
+    num_rows = steps.state.shape[0]
+    rows = (
+        data.is_start,
+        data.start,
+        steps.state,
+        data.first_mask,
+        steps.action,
+        steps.next_state,
+        data.last_mask,
+        jnp.broadcast_to(steps.dt, (num_rows,)) if steps.dt.ndim else None,
+        gains,
+    )
+    if steps.dt.ndim == 0:
+        # One length for all rows stays out of the loop, and what depends on it too.
+        def advance_uniform(state, row):
+            return advance(state, (*row[:7], steps.dt, row[8]))
+
+        return jax.lax.scan(advance_uniform, jnp.zeros(shape), rows)[1]
+    return jax.lax.scan(advance, jnp.zeros(shape), rows)[1]
+
+
+def _apply(matrix, vector: Float[Array, "body 6"], *, is_lower: bool = False):
+    """Matrix times channels, written out where there are few."""
+    flat = vector.reshape(-1)
+    num = flat.shape[0]
+    if num > _MAX_WRITTEN_OUT:
+        return (matrix @ flat).reshape(vector.shape)
+    rows = []
+    for i in range(num):
+        terms = [matrix[i, j] * flat[j] for j in range(i + 1 if is_lower else num)]
+        rows.append(sum(terms[1:], terms[0]))
+    return jnp.stack(rows).reshape(vector.shape)
