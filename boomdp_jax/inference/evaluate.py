@@ -16,7 +16,7 @@ import numpy as np
 from boomdp_jax.inference.target import StructureTarget
 
 _CHUNK = 32
-_CHUNKS_PER_CALL = 16
+_CHUNKS_PER_CALL = 8
 
 
 class Evaluation(NamedTuple):

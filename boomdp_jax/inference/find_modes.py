@@ -14,17 +14,15 @@ from boomdp_jax.core.arrays import Key
 from boomdp_jax.inference.fit import (
     Fits,
     FitSettings,
-    Guesses,
     Modes,
     best_of_each,
     climb,
     collect_modes,
-    first_fits,
-    grown_fits,
     join_fits,
     make_fits,
 )
 from boomdp_jax.inference.fit_noise import NoiseFit, fit_noise, with_gains
+from boomdp_jax.inference.fit_starts import Guesses, first_fits, grown_fits
 from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.target import StructureTarget
 
@@ -82,9 +80,10 @@ def find_modes(
         targets = with_gains(targets, top, noise)
         again = make_fits(targets, fits.index, fits.structure, fits.z)
         again = best_of_each(again, num_structures, settings.num_starts)
-        fits = climb(targets, again, settings.num_iterations)
+        limit = settings.num_repeats if number else settings.num_iterations
+        fits = climb(targets, again, limit)
         grown = grown_fits(rng, targets, guesses, fits, settings)
-        fits = join_fits(fits, climb(targets, grown, settings.num_iterations))
+        fits = join_fits(fits, climb(targets, grown, limit))
     return Found(targets, collect_modes(targets, fits, settings.num_modes), noise)
 
 

@@ -12,21 +12,20 @@ in use), and small linear systems are solved by NumPy.
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from boomdp_jax.inference.evaluate import evaluate_points
 from boomdp_jax.inference.one_step import NOISE_SHAPE
-from boomdp_jax.inference.seeds import random_starts, seed_coordinates
 from boomdp_jax.inference.target import StructureTarget
 
 _GROUP = np.array([0, 0, 1, 2, 2, 3])
 _DAMPING_FACTORS = np.array([0.1, 1.0, 10.0])
 # A fit whose log-density gains less than this in an iteration has arrived.
 _ARRIVED = 1e-3
+# After so many iterations a fit this far below the best of its structure is given up.
+_PATIENCE, _HOPELESS = 4, 30.0
 # Steps of the differences in posterior standard deviations, and their limits in prior
 # ones by float size: above the rounding of the prediction, below its curvature.
 _DIFFERENCE = 0.2
@@ -40,8 +39,10 @@ class FitSettings(NamedTuple):
     """Starts whose density is looked at."""
     num_starts: int = 4
     """Best of them that are fitted."""
-    num_iterations: int = 12
-    """Most iterations of each round: from anywhere, then from smaller structures."""
+    num_iterations: int = 10
+    """Most iterations of a climb with single steps, then again with filters."""
+    num_repeats: int = 6
+    """Most iterations of a later climb, from fits with other gains."""
     num_modes: int = 3
     """Distinct modes that are kept."""
 
@@ -178,7 +179,10 @@ def climb(targets: StructureTarget, fits: Fits, num_iterations: int) -> Fits:
     precision = fits.precision.copy()
     damping = np.full(len(value), 0.1)
     is_moving = np.isfinite(value)
-    for _ in range(num_iterations):
+    best_of = _Best(targets, fits)
+    for iteration in range(num_iterations):
+        if iteration >= _PATIENCE:
+            is_moving &= value > best_of(value) - _HOPELESS
         rows = np.flatnonzero(is_moving)
         if rows.size == 0:
             break
@@ -211,6 +215,20 @@ def climb(targets: StructureTarget, fits: Fits, num_iterations: int) -> Fits:
         has_arrived = is_better & (gain < _ARRIVED) | (damping[rows] > 1e3)
         is_moving[rows] = ~has_arrived
     return Fits(fits.index, fits.structure, z, value, precision)
+
+
+class _Best:
+    """Highest value among the fits of the same object and structure."""
+
+    def __init__(self, targets: StructureTarget, fits: Fits):
+        num_objects, num_structures = targets.structures.shape[:2]
+        self._group = fits.index * num_structures + fits.structure
+        self._num = num_objects * num_structures
+
+    def __call__(self, value: np.ndarray) -> np.ndarray:
+        best = np.full(self._num, -np.inf)
+        np.maximum.at(best, self._group, value)
+        return best[self._group]
 
 
 def normal_equations(
@@ -269,92 +287,6 @@ def _attempts(host: Host, z, gradient, matrix, damping) -> np.ndarray:
     step = np.linalg.solve(damped, right[..., None])[..., 0] / length[:, None, :]
     points = z[:, None, :] - step
     return host.wrap(np.where(np.isfinite(points), points, z[:, None, :]))
-
-
-class Guesses(NamedTuple):
-    """Where pins and axles would have to be, on the host; see `seeds`."""
-
-    z: np.ndarray
-    """`[object, dim]`."""
-    has: np.ndarray
-
-    @classmethod
-    def of(cls, targets: StructureTarget) -> "Guesses":
-        """Solve for them."""
-        z, has = _guesses(targets)
-        return cls(np.asarray(z, float), np.asarray(has))
-
-
-@eqx.filter_jit
-def _guesses(targets: StructureTarget):
-    likelihood: Any = targets.log_likelihood
-    return jax.vmap(lambda x: seed_coordinates(x.coordinates, x.data.steps))(likelihood)
-
-
-def first_fits(
-    rng: np.random.Generator,
-    targets: StructureTarget,
-    guesses: Guesses,
-    settings: FitSettings,
-) -> Fits:
-    """The best of many starts of every structure, before any climb."""
-    num_structures = targets.structures.shape[1]
-    host = Host.of(targets)
-    draws = np.stack(
-        [
-            random_starts(rng, z, has, host.period, settings.num_draws)
-            for z, has in zip(*guesses, strict=True)
-        ]
-    )
-    draws = np.where(host.in_use[None, :, None], draws[:, None], 0.0)
-    return _best_draws(targets, draws, num_structures, settings.num_starts)
-
-
-def grown_fits(
-    rng: np.random.Generator,
-    targets: StructureTarget,
-    guesses: Guesses,
-    fits: Fits,
-    settings: FitSettings,
-) -> Fits:
-    """Starts of every structure from the best fits of structures with one slot less.
-
-    The slot's own coordinates come from the prior, or from a guess. A structure that no
-    smaller one leads to starts from its own best fit, and so does the first start of
-    every structure.
-    """
-    num_objects, num_structures = targets.structures.shape[:2]
-    host = Host.of(targets)
-    best = best_of_each(fits, num_structures, 1)
-    z = best.z.reshape(num_objects, num_structures, -1)
-    num = settings.num_draws
-    draws = np.empty((num_objects, num_structures, num, z.shape[-1]))
-    parents = [_parents(targets, k) for k in range(num_structures)]
-    for i in range(num_objects):
-        block = random_starts(rng, guesses.z[i], guesses.has[i], host.period, num)
-        for k, parent in enumerate(parents):
-            chosen = parent[np.arange(num) % len(parent)]
-            is_new = host.in_use[k] & ~host.in_use[chosen]
-            draws[i, k] = np.where(is_new, block, z[i, chosen])
-            draws[i, k, 0] = z[i, k]
-    return _best_draws(targets, draws, num_structures, settings.num_starts)
-
-
-def _parents(targets: StructureTarget, structure: int) -> np.ndarray:
-    """Structures with one slot less; the structure itself if there are none."""
-    structures = np.asarray(targets.structures[0])
-    active = structures[structure]
-    less = active[None] & ~np.eye(len(active), dtype=bool)[active]
-    found = np.flatnonzero((structures[:, None] == less[None]).all(-1).any(-1))
-    return found if found.size else np.array([structure])
-
-
-def _best_draws(targets, draws: np.ndarray, num_structures: int, num: int) -> Fits:
-    num_objects, _, num_draws, dim = draws.shape
-    index = np.repeat(np.arange(num_objects), num_structures * num_draws)
-    structure = np.tile(np.repeat(np.arange(num_structures), num_draws), num_objects)
-    fits = make_fits(targets, index, structure, draws.reshape(-1, dim))
-    return best_of_each(fits, num_structures, num)
 
 
 def collect_modes(targets: StructureTarget, fits: Fits, num_modes: int) -> Modes:

@@ -40,12 +40,12 @@ class ImportanceEvidence(eqx.Module):
 
 
 class ImportanceDraws(eqx.Module):
-    """Draws from a mixture, not yet weighed."""
+    """Draws from a mixture, one or many, not yet weighed."""
 
-    structure: Int[Array, " draw"]
-    z: Float[Array, "draw dim"]
-    log_proposal: Float[Array, " draw"]
-    is_inside: Bool[Array, " draw"]
+    structure: Int[Array, "*batch"]
+    z: Float[Array, "*batch dim"]
+    log_proposal: Float[Array, "*batch"]
+    is_inside: Bool[Array, "*batch"]
     """False where a draw fell outside; it has no weight."""
 
 

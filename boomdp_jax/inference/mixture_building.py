@@ -141,6 +141,59 @@ def add_prior_components(
     )
 
 
+def add_spare_components(
+    target: StructureTarget, mixture: LaplaceMixture
+) -> LaplaceMixture:
+    """Add padding, one component a structure, for `fit_spare_components` to fill."""
+    num_structures, dim = target.num_structures, target.dim
+    dtype = mixture.mean.dtype
+    spare = make_mixture(
+        target,
+        jnp.arange(num_structures, dtype=mixture.structure.dtype),
+        jnp.zeros((num_structures, dim), dtype),
+        jnp.broadcast_to(jnp.eye(dim, dtype=dtype), (num_structures, dim, dim)),
+        jnp.zeros(num_structures, dtype),
+        degrees_of_freedom=mixture.degrees_of_freedom,
+    )
+    padding = jnp.full(num_structures, -jnp.inf, dtype)
+    return _concatenate(target, mixture, _weighted(spare, padding))
+
+
+def fit_spare_components(
+    target: StructureTarget,
+    mixture: LaplaceMixture,
+    mean: Float[Array, "structure dim"],
+    scale_tril: Float[Array, "structure dim dim"],
+    share: Float[Array, " structure"],
+) -> LaplaceMixture:
+    """Fill the padding of `add_spare_components`.
+
+    A fit to draws covers ridges and skew that a bump on the mode leaves out.
+
+    Args:
+        target: says which structures exist.
+        mixture: whose last components, one a structure, are padding.
+        mean: of each new component.
+        scale_tril: Cholesky factor of its squared scale.
+        share: of the structure's weight that it gets; zero leaves it out.
+    """
+    num = target.num_structures
+    structure = mixture.structure
+    kept = mixture.log_weight + jnp.log1p(-share)[structure]
+    whole = mixture.structure_log_weight(target)
+    is_used = share > 0
+    new = whole + jnp.log(jnp.where(is_used, share, 1.0))
+    return make_mixture(
+        target,
+        structure,
+        mixture.mean.at[-num:].set(mean),
+        mixture.scale_tril.at[-num:].set(scale_tril),
+        kept.at[-num:].set(jnp.where(is_used, new, -jnp.inf)),
+        from_prior=mixture.from_prior,
+        degrees_of_freedom=mixture.degrees_of_freedom,
+    )
+
+
 def refine_weights(
     target: StructureTarget,
     mixture: LaplaceMixture,

@@ -27,7 +27,7 @@ from boomdp_jax.inference.importance_evidence import (
     weigh_draws,
 )
 from boomdp_jax.inference.laplace_mixture import LaplaceMixture
-from boomdp_jax.inference.mixture_building import refine_weights
+from boomdp_jax.inference.mixture_building import fit_spare_components, refine_weights
 from boomdp_jax.inference.moves import (
     MOVES,
     MoveInfo,
@@ -45,6 +45,9 @@ from boomdp_jax.inference.target import StructureTarget
 _CYCLE = ("jump", "walk", "change", "walk", "jump")
 _PRIOR_SHARE = 0.3
 _WALK_ACCEPT = 0.4
+# A component is fitted to walkers of a structure if this many per coordinate differ,
+# and gets this share of the structure's weight.
+_WALKERS_PER_DIM, _SPARE_SHARE = 4, 0.6
 
 
 class PopulationSettings(NamedTuple):
@@ -116,6 +119,10 @@ def sample_population(
                 _count(proposed, accepted, MOVES.index(move), info)
         if not is_warm_up:
             kept.append(points)
+        elif sweep == settings.num_warmup - 1:
+            mixtures = _adapt(targets, mixtures, points)
+            proposal = _log_proposal(targets, mixtures, points.structure, points.z)
+            points = eqx.tree_at(lambda p: p.log_proposal, points, proposal)
     return Population(
         draws=_arrange(kept, settings),
         counts=MoveCounts(proposed, accepted),
@@ -176,6 +183,48 @@ def _refine(targets: StructureTarget, mixtures: LaplaceMixture, evidence):
     return jax.vmap(
         lambda t, m, e: refine_weights(t, m, e.structure, e.z, e.log_weight)
     )(targets, mixtures, evidence)
+
+
+@eqx.filter_jit
+def _fit_spare(targets, mixtures, mean, scale_tril, share):
+    return jax.vmap(fit_spare_components)(targets, mixtures, mean, scale_tril, share)
+
+
+def _adapt(
+    targets: StructureTarget, mixtures: LaplaceMixture, points: Point
+) -> LaplaceMixture:
+    """Fit a component to the walkers in each structure where there are enough."""
+    structure, z = np.asarray(points.structure), np.asarray(points.z, float)
+    num_objects, num_structures = targets.structures.shape[:2]
+    dim = z.shape[-1]
+    period = np.asarray(targets.period, float)
+    mean = np.zeros((num_objects, num_structures, dim))
+    tril = np.tile(np.eye(dim), (num_objects, num_structures, 1, 1))
+    share = np.zeros((num_objects, num_structures))
+    for i, k in np.ndindex(num_objects, num_structures):
+        mine = z[i, structure[i] == k]
+        if len(np.unique(mine, axis=0)) < _WALKERS_PER_DIM * dim:
+            continue
+        is_angle = period[i] > 0
+        turn = np.where(is_angle, period[i], 1.0)
+        offset = mine - mine[0]
+        offset -= np.where(is_angle, turn * np.round(offset / turn), 0.0)
+        middle = offset.mean(0)
+        # Coordinates not in use are all zero and get a scale of one.
+        in_use = np.ptp(mine, axis=0) > 0
+        covariance = np.atleast_2d(np.cov(offset, rowvar=False))
+        covariance = covariance * np.outer(in_use, in_use)
+        covariance += np.diag(~in_use) + np.diag(1e-6 * np.diag(covariance))
+        try:
+            tril[i, k] = np.linalg.cholesky(covariance)
+        except np.linalg.LinAlgError:
+            continue
+        mean[i, k] = mine[0] + middle
+        mean[i, k] -= np.where(is_angle, turn * np.round(mean[i, k] / turn), 0.0)
+        share[i, k] = _SPARE_SHARE
+    dtype = points.z.dtype
+    parts = (jnp.asarray(part, dtype) for part in (mean, tril, share))
+    return _fit_spare(targets, mixtures, *parts)
 
 
 def _start(

@@ -17,6 +17,7 @@ from boomdp_jax.inference.fit import FitSettings
 from boomdp_jax.inference.mixture_building import (
     add_prior_components,
     add_slot_components,
+    add_spare_components,
     laplace_mixture,
 )
 from boomdp_jax.inference.noise import host_generator
@@ -79,7 +80,8 @@ def _mixtures(targets: StructureTarget, modes):
             target, modes.structure, modes.z, modes.precision, modes.log_density
         )
         mixture = add_slot_components(target, mixture, total_weight=0.4)
-        return add_prior_components(target, mixture, total_weight=0.02)
+        mixture = add_prior_components(target, mixture, total_weight=0.02)
+        return add_spare_components(target, mixture)
 
     return jax.vmap(one)(targets, modes)
 
