@@ -48,7 +48,9 @@ def make_block(spec: SceneSpec, bodies: tuple[int, ...], history: History) -> Bl
     """
     options = read_prior(spec.prior, spec.source)
     layout = block_layout(spec, bodies)
-    rows, log_prior = structures(layout, spec.unknown, options)
+    rows, log_prior = structures(
+        layout, spec.unknown, options, is_loaded=spec.normal_gravity > 0
+    )
     positions = _positions(history, bodies)
     coordinates = Coordinates(
         layout=layout,

@@ -12,8 +12,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool
 
 from boomdp_jax.inference.target import StructureTarget
+from boomdp_jax.inference.tracking import Gains
 
 _CHUNK = 32
 _CHUNKS_PER_CALL = 8
@@ -31,28 +33,54 @@ class Evaluation(NamedTuple):
     """Whitened innovations, `[point, reading]`."""
 
 
-@eqx.filter_jit
-def _evaluate_chunks(targets: StructureTarget, index, structure, z):
-    """Chunks `[chunk, point, dim]`, each of one object and structure."""
+class _Chunks(NamedTuple):
+    """What the points of each chunk share; leading axis `chunk`."""
 
-    def one_chunk(i, k, z):
-        target = jax.tree.map(lambda leaf: leaf[i], targets)
-        likelihood: Any = target.log_likelihood
-        gains = likelihood.gains_of(k)
+    likelihood: Any
+    """Without structures and gains, whose shapes depend on the number of structures."""
+    gains: Gains
+    active: Bool[Array, "chunk slot"]
+
+
+@eqx.filter_jit
+def _gather(targets: StructureTarget, index, structure) -> _Chunks:
+    likelihood: Any = targets.log_likelihood
+    gains = jax.tree.map(lambda leaf: leaf[index, structure], likelihood.gains)
+    bare = eqx.tree_at(lambda x: (x.gains, x.structures), likelihood, (None, None))
+    bare = jax.tree.map(lambda leaf: leaf[index], bare)
+    return _Chunks(bare, gains, targets.structures[index, structure])
+
+
+@eqx.filter_jit
+def _evaluate_chunks(chunks: _Chunks, z):
+    """Log-likelihoods of chunks `[chunk, point, dim]`."""
+
+    def one_chunk(chunk, z):
+        likelihood, gains, active = chunk
         log_volume = gains.log_volume
 
         def one_point(z):
-            found = likelihood.innovations(z, target.structures[k], gains)
+            found = likelihood.innovations(z, active, gains)
             value = likelihood.log_marginal(found.statistics, log_volume)
-            return (
-                target.log_prior_density(k, z) + value,
-                found.statistics,
-                found.whitened.reshape(-1),
-            )
+            return value, found.statistics, found.whitened.reshape(-1)
 
         return jax.vmap(one_point)(z)
 
-    return jax.vmap(one_chunk)(index, structure, z)
+    return jax.vmap(one_chunk)(chunks, z)
+
+
+def log_prior_density(
+    targets: StructureTarget, index: np.ndarray, structure: np.ndarray, z: np.ndarray
+) -> np.ndarray:
+    """The same as `StructureTarget.log_prior_density`, of many points on the host."""
+    period = np.asarray(targets.period, float)[index]
+    slots, slot = np.asarray(targets.structures[0]), np.asarray(targets.slot[0])
+    active = np.concatenate([slots, np.ones((len(slots), 1), bool)], axis=1)
+    normal = -0.5 * z**2 - 0.5 * np.log(2.0 * np.pi)
+    uniform = -np.log(np.where(period > 0, period, 1.0))
+    each = np.where(period > 0, uniform, normal)
+    total = np.sum(np.where(active[:, slot][structure], each, 0.0), axis=1)
+    return np.asarray(targets.log_prior, float)[index, structure] + total
 
 
 def evaluate_points(
@@ -102,14 +130,12 @@ def evaluate_points(
     calls = []
     for number in range(num_calls):
         rows = slice(number * _CHUNKS_PER_CALL, (number + 1) * _CHUNKS_PER_CALL)
-        calls.append(
-            _evaluate_chunks(
-                targets,
-                jnp.asarray(owner[rows] // num_structures, jnp.int32),
-                jnp.asarray(owner[rows] % num_structures, jnp.int32),
-                jnp.asarray(z[source[rows]], dtype),
-            )
+        chunks = _gather(
+            targets,
+            jnp.asarray(owner[rows] // num_structures, jnp.int32),
+            jnp.asarray(owner[rows] % num_structures, jnp.int32),
         )
+        calls.append(_evaluate_chunks(chunks, jnp.asarray(z[source[rows]], dtype)))
     flat = source[:total].reshape(-1)
 
     def gather(pick):
@@ -119,9 +145,10 @@ def evaluate_points(
         out[flat] = joined
         return out
 
-    log_density = gather(lambda call: call[0])
+    log_likelihood = gather(lambda call: call[0]).astype(float)
+    log_density = log_likelihood + log_prior_density(targets, index, structure, z)
     return Evaluation(
-        log_density=np.where(log_density > -1e29, log_density, -np.inf),
+        log_density=np.where(log_likelihood > -1e29, log_density, -np.inf),
         num=gather(lambda call: call[1].num),
         square=gather(lambda call: call[1].square),
         innovation=gather(lambda call: call[2]) if with_innovations else None,

@@ -35,9 +35,9 @@ class FilteredLikelihood(eqx.Module):
 
     coordinates: Coordinates
     data: TrackData
-    structures: Bool[Array, "structure slot"]
-    gains: Gains
-    """With a leading structure axis."""
+    structures: Bool[Array, "structure slot"] | None
+    gains: Gains | None
+    """With a leading structure axis. Both may be absent where gains are passed on."""
     reference: Float[Array, "body 4"]
     """Noise that the gains were made for."""
 

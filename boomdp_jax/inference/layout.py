@@ -100,11 +100,8 @@ def block_layout(spec: SceneSpec, bodies: tuple[int, ...]) -> Layout:
         if constraint.body_a in place:
             partner = place.get(constraint.body_b, WORLD)
             add(known, constraint.kind, place[constraint.body_a], partner, entry)
-    is_loaded = spec.normal_gravity > 0
     movable = [i for i, body in enumerate(bodies) if not spec.is_static[body]]
     for kind in ("revolute", "distance", "wheel", "ground"):
-        if kind in ("wheel", "ground") and not is_loaded:
-            continue  # What carries no load has no friction with the floor.
         for i in movable:
             for _ in range(spec.unknown.get(kind, 0)):
                 add(inferred, kind, i, WORLD, -1)
@@ -116,7 +113,11 @@ def block_layout(spec: SceneSpec, bodies: tuple[int, ...]) -> Layout:
 
 
 def structures(
-    layout: Layout, caps: dict[str, int], options: PriorOptions
+    layout: Layout,
+    caps: dict[str, int],
+    options: PriorOptions,
+    *,
+    is_loaded: bool = True,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Every structure that a block may have, and its prior.
 
@@ -128,6 +129,9 @@ def structures(
         layout: slots of the block.
         caps: most inferred constraints of each kind that one body may have.
         options: probabilities.
+        is_loaded: whether the floor carries the bodies. What it does not carry has no
+            wheel and no friction with it: such structures are listed, so that shapes do
+            not depend on the load, with a probability of zero.
 
     Returns:
         Active slots, `[structure, slot]`, and normalised log-probabilities.
@@ -145,6 +149,8 @@ def structures(
             f"{layout.num_bodies} bodies; expected at most {_MAX_STRUCTURES}; lower "
             "the caps in 'unknown'"
         )
+    needs_load = [slot.kind in ("wheel", "ground") for slot in layout.slots]
+    needs_load = np.array(needs_load, bool)
     rows, weights = [], []
     for counts in itertools.product(*(range(size) for size in sizes)):
         used: dict[tuple, int] = {}
@@ -161,7 +167,8 @@ def structures(
             count <= caps.get(kind, 0) for (kind, _), count in used.items()
         ):
             rows.append(row)
-            weights.append(weight)
+            is_possible = is_loaded or not row[needs_load].any()
+            weights.append(weight if is_possible else -math.inf)
     log_prior = np.array(weights)
     return np.stack(rows), log_prior - np.logaddexp.reduce(log_prior)
 

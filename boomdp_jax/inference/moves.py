@@ -25,7 +25,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar, Key
 from boomdp_jax.inference.laplace_mixture import LaplaceMixture, is_in_cell
@@ -38,13 +38,13 @@ MOVES = ("jump", "change", "walk", "leap")
 
 
 class Point(eqx.Module):
-    """A structure with coordinates, and both log-densities there."""
+    """Structures with coordinates, one or many, and both log-densities there."""
 
-    structure: IntScalar
-    z: Float[Array, " dim"]
-    log_density: FloatScalar
+    structure: Int[Array, "*batch"]
+    z: Float[Array, "*batch dim"]
+    log_density: Float[Array, "*batch"]
     """Of the target; minus infinity marks a proposal that cannot be accepted."""
-    log_proposal: FloatScalar
+    log_proposal: Float[Array, "*batch"]
     """Of the mixture."""
 
 

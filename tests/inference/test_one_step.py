@@ -10,6 +10,7 @@ from boomdp_jax.inference.block import make_block
 from boomdp_jax.inference.components import independent_blocks
 from boomdp_jax.inference.one_step import (
     NoiseStatistics,
+    OneStepLikelihood,
     draw_noise,
     group_sums,
     log_marginal,
@@ -76,14 +77,19 @@ def _free_flight(num_rows, density, force):
     return make_history(state[:-1], action, state[1:], dt)
 
 
+def _one_step(spec, history):
+    tracked = make_block(spec, (0,), history).target.log_likelihood
+    return OneStepLikelihood(tracked.coordinates, tracked.data.steps)
+
+
 def test_the_true_density_has_no_residuals():
     spec = _scene(1)
-    target = make_block(spec, (0,), _free_flight(20, 12.0, 3.0)).target
+    likelihood = _one_step(spec, _free_flight(20, 12.0, 3.0))
     scale, spread = np.log(30.0), 1.5
     z = jnp.array([(np.log(12.0) - scale) / spread])
-    r = target.log_likelihood.residuals(z, jnp.zeros(0, bool))
+    r = likelihood.residuals(z, jnp.zeros(0, bool))
     np.testing.assert_allclose(r, 0.0, atol=1e-12)
-    other = target.log_likelihood.residuals(z + 0.1, jnp.zeros(0, bool))
+    other = likelihood.residuals(z + 0.1, jnp.zeros(0, bool))
     gained = 3.0 / (12.0 * 0.08) * 0.02
     np.testing.assert_allclose(other[..., 3], gained * np.expm1(-0.15), rtol=1e-9)
 
@@ -93,8 +99,7 @@ def test_masked_rows_and_channels_do_not_count():
     state = np.array(history.next_state)
     state[3, 0, 4] = np.nan
     gaps = make_history(history.state, history.action, state, 0.02, capacity=32)
-    target = make_block(spec, (0,), gaps).target
-    statistics = target.log_likelihood.statistics(jnp.zeros(1), jnp.zeros(0, bool))
+    statistics = _one_step(spec, gaps).statistics(jnp.zeros(1), jnp.zeros(0, bool))
     np.testing.assert_array_equal(statistics.num[0], [40, 20, 39, 20])
 
 
