@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 
 from boomdp_jax.core.arrays import Key
+from boomdp_jax.core.compile_time import CompileClock
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.assemble import BlockResult, assemble_posterior
 from boomdp_jax.inference.block import Block, make_block, stack_blocks
@@ -109,7 +110,7 @@ def infer_batch(
         problems += [(index, make_block(spec, b, history)) for b in blocks]
     results: dict[int, list[BlockResult]] = {i: [] for i in range(len(specs))}
     groups = _group(problems)
-    with _Bar(progress, len(problems)) as bar:
+    with CompileClock() as clock, _Bar(progress, len(problems)) as bar:
         for number, members in enumerate(groups):
             group_key = jax.random.fold_in(key, number)
             stacked = stack_blocks([block for _, block in members])
@@ -117,7 +118,8 @@ def infer_batch(
             for place, (index, block) in enumerate(members):
                 results[index].append(BlockResult(block, draws, place))
             bar.advance(len(members))
-    seconds = {"compile": None, "run": time.perf_counter() - start}
+    wall = time.perf_counter() - start
+    seconds = {"compile": clock.seconds, "run": max(wall - clock.seconds, 0.0)}
     return [
         assemble_posterior(
             jax.random.fold_in(key, len(groups) + index),

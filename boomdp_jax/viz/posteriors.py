@@ -312,4 +312,4 @@ def _title(posterior: Posterior, body: int) -> str:
     low, middle, high = weighted_quantiles(
         mass[:, None], posterior.weights, (0.05, 0.5, 0.95)
     )[:, 0]
-    return f"{spec.name}: mass {middle:.3g} kg (90 %: {low:.3g} to {high:.3g})"
+    return f"{spec.name}: mass {middle:.4g} kg (90 %: {low:.4g} to {high:.4g})"

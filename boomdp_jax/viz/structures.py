@@ -3,8 +3,12 @@
 import textwrap
 from typing import Any
 
+import numpy as np
+
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.viz.style import EDGE, WHEEL
+
+_FEWEST_ROWS = 3
 
 
 def draw_structure_bars(ax: Any, posterior: Posterior, *, num_bars: int = 6) -> None:
@@ -13,11 +17,13 @@ def draw_structure_bars(ax: Any, posterior: Posterior, *, num_bars: int = 6) -> 
     Args:
         ax: a `matplotlib.axes.Axes`.
         posterior: what is believed.
-        num_bars: bars to draw at most; the rest is one bar more, "all others".
+        num_bars: bars to draw at most; the rest, structures that no draw has among
+            them, is one bar more, "all others".
     """
     entries = list(posterior.structure_probabilities().items())
     shown, rest = entries[:num_bars], entries[num_bars:]
-    if rest:
+    num_possible = 2 ** sum(int(np.sum(slots)) for slots in posterior.inferred.values())
+    if rest or len(entries) < num_possible:
         shown.append(("all others", sum(value for _, value in rest)))
     places = range(len(shown))
     values = [value for _, value in shown]
@@ -37,7 +43,8 @@ def draw_structure_bars(ax: Any, posterior: Posterior, *, num_bars: int = 6) -> 
             color="white" if inside else EDGE,
         )
     ax.set_yticks(list(places), [textwrap.fill(name, 26) for name, _ in shown])
-    ax.set_ylim(len(shown) - 0.4, -0.6)
+    # Bars keep a like thickness, however few there are.
+    ax.set_ylim(max(len(shown), _FEWEST_ROWS) - 0.4, -0.6)
     ax.set_xlim(0.0, 1.0)
     ax.set_xlabel("probability of the structure")
     ax.spines[["top", "right"]].set_visible(False)

@@ -21,10 +21,10 @@ def spec(num_bodies, unknown, **fields):
     )
 
 
-def listed(scene):
+def listed(scene, **load):
     layout = block_layout(scene, tuple(range(scene.num_bodies)))
     options = read_prior(scene.prior, scene.source)
-    return layout, *structures(layout, scene.unknown, options)
+    return layout, *structures(layout, scene.unknown, options, **load)
 
 
 def test_one_body_with_three_optional_constraints_has_eight_structures():
@@ -59,9 +59,13 @@ def test_a_tie_counts_against_the_caps_of_both_bodies():
 
 def test_a_scene_without_load_has_neither_wheels_nor_ground():
     scene = spec(1, {"revolute": 1, "wheel": 1, "ground": 1}, gravity=[0.0, -9.81])
-    layout, rows, _ = listed(scene)
-    assert [slot.kind for slot in layout.slots] == ["revolute"]
-    assert len(rows) == 2
+    layout, rows, log_prior = listed(scene, is_loaded=False)
+    kinds = np.array([slot.kind for slot in layout.slots])
+    possible = rows[np.isfinite(log_prior)]
+    assert len(possible) == 2
+    assert not possible[:, kinds != "revolute"].any()
+    # What is left keeps its proportions.
+    np.testing.assert_allclose(np.sort(np.exp(log_prior))[-2:], [0.2, 0.8])
 
 
 def test_coordinates_of_slots_do_not_overlap():

@@ -118,10 +118,11 @@ def test_improbable_constraints_are_left_out(ax):
 def test_bars_are_as_long_as_the_probabilities(ax):
     draw_structure_bars(ax, table_posterior(80))
     widths = [bar.get_width() for bar in ax.patches]
-    assert widths == pytest.approx([0.75, 0.25])
+    # Structures that are possible and have no draw are shown as such.
+    assert widths == pytest.approx([0.75, 0.25, 0.0])
     names = [label.get_text() for label in ax.get_yticklabels()]
-    assert names == ["pin", "pin + wheel"]
-    assert [text.get_text() for text in ax.texts] == ["0.750", "0.250"]
+    assert names == ["pin", "pin + wheel", "all others"]
+    assert [text.get_text() for text in ax.texts] == ["0.750", "0.250", "< 0.001"]
 
 
 def test_bars_beyond_the_most_are_put_together(ax):
