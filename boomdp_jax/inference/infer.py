@@ -3,7 +3,6 @@
 import time
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 
 from boomdp_jax.core.arrays import Key
@@ -11,6 +10,7 @@ from boomdp_jax.core.compile_time import CompileClock
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.assemble import BlockResult, assemble_posterior
 from boomdp_jax.inference.block import Block, make_block, stack_blocks
+from boomdp_jax.inference.compile_ahead import signature
 from boomdp_jax.inference.components import independent_blocks
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.sample import SampleSettings, sample_blocks
@@ -151,11 +151,7 @@ def _group(problems: list[tuple[int, Block]]) -> list[list[tuple[int, Block]]]:
     """Blocks whose targets have the same static parts and array shapes."""
     groups: dict[object, list[tuple[int, Block]]] = {}
     for problem in problems:
-        arrays, static = eqx.partition(problem[1].target, eqx.is_array)
-        leaves, treedef = jax.tree.flatten(arrays)
-        shapes = tuple((leaf.shape, str(leaf.dtype)) for leaf in leaves)
-        signature = (shapes, treedef, str(jax.tree.structure(static)))
-        groups.setdefault(signature, []).append(problem)
+        groups.setdefault(signature(problem[1].target), []).append(problem)
     return list(groups.values())
 
 

@@ -11,6 +11,7 @@ Prefer this to `structure_chain.run_chains` where a likelihood is far cheaper in
 than alone.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -86,6 +87,8 @@ def sample_population(
     targets: StructureTarget,
     mixtures: LaplaceMixture,
     settings: PopulationSettings,
+    *,
+    evaluate: Callable[..., Array] | None = None,
 ) -> Population:
     """Draw from the posteriors of a batch of objects.
 
@@ -94,14 +97,18 @@ def sample_population(
         targets: with a `FilteredLikelihood`, stacked along a leading object axis.
         mixtures: one of each object.
         settings: how much to draw.
+        evaluate: from targets, structures `[object, point]` and coordinates `[object,
+            point, dim]` to log-densities `[object, point]`; default: that of the
+            targets, in chunks.
 
     Returns:
         Draws of every chain, move counts, and evidence by importance sampling.
     """
+    evaluate = _evaluate if evaluate is None else evaluate
     rng = host_generator(key)
-    evidence = _weigh(rng, targets, mixtures, settings.num_importance)
+    evidence = _weigh(rng, targets, mixtures, settings.num_importance, evaluate)
     mixtures = _refine(targets, mixtures, evidence)
-    evidence = _weigh(rng, targets, mixtures, settings.num_importance)
+    evidence = _weigh(rng, targets, mixtures, settings.num_importance, evaluate)
     points = _start(evidence, targets, mixtures, settings)
     num_objects = targets.structures.shape[0]
     step_size = np.full(num_objects, 0.5)
@@ -111,7 +118,8 @@ def sample_population(
     for sweep in range(settings.num_warmup + settings.num_sweeps):
         is_warm_up = sweep < settings.num_warmup
         for move in _CYCLE:
-            points, info = _move(move, rng, points, targets, mixtures, step_size)
+            batch = _proposals(move, rng, points, targets, mixtures, step_size)
+            points, info = _verdict(rng, points, targets, batch, evaluate)
             if move == "walk" and is_warm_up:
                 rate = np.asarray(jnp.mean(info.accept_probability, axis=1), float)
                 step_size = np.clip(step_size * np.exp(rate - _WALK_ACCEPT), 0.02, 0.98)
@@ -145,13 +153,14 @@ def _weigh(
     targets: StructureTarget,
     mixtures: LaplaceMixture,
     num_draws: int,
+    evaluate: Callable[..., Array],
 ) -> ImportanceEvidence:
     """Draw from mixtures and weigh the draws."""
     num_objects = targets.structures.shape[0]
     noise = _noise(rng, targets, mixtures, num_draws)
     offset = jnp.asarray(rng.random(num_objects), noise.normal.dtype)
     draws = _draw(offset, noise, targets, mixtures)
-    return _weigh_all(targets, draws, _evaluate(targets, draws.structure, draws.z))
+    return _weigh_all(targets, draws, evaluate(targets, draws.structure, draws.z))
 
 
 def _noise(
@@ -332,21 +341,30 @@ def _decide(
     return jax.vmap(jax.vmap(one))(points, batch, log_density, uniform)
 
 
-def _move(
+def _proposals(
     move: str,
     rng: np.random.Generator,
     points: Point,
     targets: StructureTarget,
     mixtures: LaplaceMixture,
     step_size: np.ndarray,
-) -> tuple[Point, MoveInfo]:
-    """One move of every walker."""
-    dtype = points.z.dtype
+) -> _Batch:
+    """A proposal of every walker."""
     noise = _noise(rng, targets, mixtures, points.structure.shape[1])
-    size = jnp.asarray(step_size, dtype)
-    batch = _propose(move, noise, points, targets, mixtures, size)
-    proposal = batch.proposal
-    log_density = _evaluate(targets, proposal.structure, proposal.z).astype(dtype)
+    size = jnp.asarray(step_size, points.z.dtype)
+    return _propose(move, noise, points, targets, mixtures, size)
+
+
+def _verdict(
+    rng: np.random.Generator,
+    points: Point,
+    targets: StructureTarget,
+    batch: _Batch,
+    evaluate: Callable[..., Array],
+) -> tuple[Point, MoveInfo]:
+    """Accept or refuse every proposal."""
+    proposal, dtype = batch.proposal, points.z.dtype
+    log_density = evaluate(targets, proposal.structure, proposal.z).astype(dtype)
     # Which choices a proposal makes is its own affair; the verdict gets a fresh number.
     uniform = jnp.asarray(1.0 - rng.random(points.structure.shape), dtype)
     return _decide(points, batch, log_density, uniform)

@@ -11,9 +11,11 @@ from jaxtyping import Array, Float, Int
 
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics, diagnose_chains
+from boomdp_jax.inference.compile_ahead import CompileAhead, signature
 from boomdp_jax.inference.evaluate import evaluate_points
 from boomdp_jax.inference.find_modes import Found, find_modes
-from boomdp_jax.inference.fit import FitSettings
+from boomdp_jax.inference.fit import FitSettings, Modes
+from boomdp_jax.inference.fit_noise import NoiseFit, filter_points
 from boomdp_jax.inference.mixture_building import (
     add_prior_components,
     add_slot_components,
@@ -104,7 +106,11 @@ def sample_blocks(
         Draws of all chains one after the other, noise drawn given each.
     """
     fit_key, chain_key, noise_key = jax.random.split(key, 3)
-    found: Found = find_modes(fit_key, targets, settings.fit, report)
+    ahead = CompileAhead(
+        lambda: _rehearse(chain_key, targets, settings), (signature(targets), settings)
+    )
+    with ahead:
+        found: Found = find_modes(fit_key, targets, settings.fit, report)
     targets = found.targets
     report("jumping between structures")
     mixtures = _mixtures(targets, found.modes)
@@ -125,6 +131,37 @@ def sample_blocks(
         importance_size=evidence.effective_sample_size,
         diagnostics=[_diagnose(targets, population, i) for i in range(num_objects)],
         chain_index=np.arange(settings.num_chains),
+    )
+
+
+def _rehearse(key: Key, targets: StructureTarget, settings: SampleSettings) -> None:
+    """Go through all stages but the likelihood of many points, to compile them."""
+    num_objects, num_structures = targets.structures.shape[:2]
+    likelihood: Any = targets.log_likelihood
+    reading = np.asarray(likelihood.reference, float)[:1]
+    dim = targets.slot.shape[1]
+    first = np.zeros(1, int)
+    noise = NoiseFit(reading, reading[..., 2:])
+    filter_points(targets, first, first, np.zeros((1, dim)), noise)
+    num_modes = num_structures * settings.fit.num_modes
+    dtype = targets.log_prior.dtype
+    structure = jnp.repeat(
+        jnp.arange(num_structures, dtype=jnp.int32), settings.fit.num_modes
+    )
+    modes = Modes(
+        structure=jnp.broadcast_to(structure[None], (num_objects, num_modes)),
+        z=jnp.zeros((num_objects, num_modes, dim), dtype),
+        precision=jnp.broadcast_to(
+            jnp.eye(dim, dtype=dtype), (num_objects, num_modes, dim, dim)
+        ),
+        log_density=jnp.zeros((num_objects, num_modes), dtype),
+    )
+    sample_population(
+        key,
+        targets,
+        _mixtures(targets, modes),
+        settings.population._replace(num_warmup=1, num_sweeps=1),
+        evaluate=lambda targets, structure, z: jnp.zeros(structure.shape, dtype),
     )
 
 
