@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 from numpyro.infer.mcmc import MCMCKernel
 from numpyro.util import is_prng_key
 
@@ -24,11 +24,21 @@ from boomdp_jax.inference.structure_chain import (
 from boomdp_jax.inference.target import StructureTarget
 
 
+class Sample(NamedTuple):
+    """Where a chain stands.
+
+    Not a dictionary: of that, NumPyro's summary would show only what it has before
+    `postprocess`.
+    """
+
+    structure: IntScalar
+    z: Float[Array, "*chain dim"]
+
+
 class KernelState(NamedTuple):
     """State of one chain, or of several with a leading axis, as NumPyro carries it."""
 
-    sample: dict[str, Array]
-    """`structure` and coordinates `z`."""
+    sample: Sample
     log_density: FloatScalar
     chain: ChainState
     info: ChainInfo
@@ -122,9 +132,8 @@ class StructureKernel(MCMCKernel):
 
     def postprocess_fn(self, model_args: tuple, model_kwargs: dict | None) -> Callable:
         """What turns a sample into what `get_samples` returns."""
-        return (
-            (lambda sample: sample) if self._postprocess is None else self._postprocess
-        )
+        postprocess = self._postprocess or (lambda sample: sample)
+        return lambda sample: postprocess(sample._asdict())
 
     def get_diagnostics_str(self, state: KernelState) -> str:
         """Acceptance so far, for the progress bar."""
@@ -136,9 +145,7 @@ class StructureKernel(MCMCKernel):
             for name, share, num in zip(MOVES, shares, proposed.sum(-1), strict=True)
             if num
         ]
-        return f"structure {int(state.sample['structure'])}, accepted: " + ", ".join(
-            parts
-        )
+        return f"structure {int(state.sample.structure)}, accepted: " + ", ".join(parts)
 
     def _start(
         self, key: Key, num_warmup: int, init_params: dict[str, Array] | None
@@ -152,7 +159,7 @@ class StructureKernel(MCMCKernel):
             chain = eqx.tree_at(lambda chain: chain.point, chain, point)
         zeros = jnp.zeros((len(MOVES), 2), jnp.int32)
         return KernelState(
-            sample={"structure": chain.point.structure, "z": chain.point.z},
+            sample=Sample(chain.point.structure, chain.point.z),
             log_density=chain.point.log_density,
             chain=chain,
             info=ChainInfo(zeros, zeros),
@@ -176,7 +183,7 @@ class StructureKernel(MCMCKernel):
             info,
         )
         return KernelState(
-            sample={"structure": chain.point.structure, "z": chain.point.z},
+            sample=Sample(chain.point.structure, chain.point.z),
             log_density=chain.point.log_density,
             chain=chain,
             info=totals,

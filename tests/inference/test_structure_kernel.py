@@ -93,7 +93,7 @@ def test_numpyro_single_chain_shows_progress_and_postprocesses(capsys):
     mcmc = MCMC(kernel, num_warmup=2, num_samples=4, num_chains=1)
     start = {"structure": jnp.asarray(1), "z": jnp.asarray([0.1, 0.2, 9.0, 9.0, 9.0])}
     state = kernel.init(jax.random.key(0), 2, start)
-    np.testing.assert_array_equal(state.sample["z"], [0.1, 0.2, 0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(state.sample.z, [0.1, 0.2, 0.0, 0.0, 0.0])
     mcmc.run(jax.random.key(0), init_params=start)
     assert mcmc.get_samples()["first"].shape == (4,)
     assert "jump" in kernel.get_diagnostics_str(mcmc.last_state)

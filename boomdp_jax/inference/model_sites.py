@@ -1,0 +1,231 @@
+"""Which numbers of a block are sampled under which name, with which distribution.
+
+The distributions are those of `coordinates.py`, stated on physical numbers: one site is
+an affine map of a few standard-normal coordinates, or its exponential or logistic.
+Coefficients are sampled relative to mass and weight, as there.
+"""
+
+import math
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+from jax.scipy.special import logit
+from jaxtyping import Array, Float
+from numpyro.distributions import constraints, transforms
+
+from boomdp_jax.inference.block import Block
+from boomdp_jax.inference.layout import SlotKey
+from boomdp_jax.inference.prior import LOGARITHMIC
+from boomdp_jax.inference.slot_names import slot_names
+from boomdp_jax.physics.params import WORLD
+
+Link = Literal["identity", "log", "logit", "half_turn"]
+
+
+class Site(NamedTuple):
+    """One sample site; its `coordinates` are (link(value) - loc) / scale."""
+
+    name: str
+    coordinates: tuple[int, ...]
+    """Places in the block's coordinates; one for a scalar."""
+    link: Link
+    loc: Array
+    scale: Array
+
+    @property
+    def prior(self) -> dist.Distribution:
+        """Distribution of the value."""
+        if self.link == "half_turn":
+            return HalfTurn()
+        if self.link == "log":
+            return dist.LogNormal(self.loc, self.scale)
+        normal: Any = dist.Normal(self.loc, self.scale)
+        if self.link == "logit":
+            return dist.TransformedDistribution(normal, transforms.SigmoidTransform())
+        return normal.to_event(self.loc.ndim)
+
+    def to_coordinates(self, value: Array) -> Float[Array, " coordinate"]:
+        """Coordinates of a value."""
+        linked = value
+        if self.link == "log":
+            linked = jnp.log(value)
+        elif self.link == "logit":
+            linked = logit(value)
+        elif self.link == "half_turn":
+            linked = value - math.pi * jnp.floor(value / math.pi + 0.5)
+        return jnp.reshape((linked - self.loc) / self.scale, -1)
+
+    def from_coordinates(self, z: Float[Array, " dim"]) -> Array:
+        """The value at coordinates of the whole block."""
+        linked = self.loc + self.scale * jnp.reshape(
+            z[jnp.asarray(self.coordinates)], self.loc.shape
+        )
+        if self.link == "log":
+            return jnp.exp(linked)
+        return jax.nn.sigmoid(linked) if self.link == "logit" else linked
+
+
+class HalfTurn(dist.Distribution):
+    r"""Uniform over directions that are the same when turned by half a turn [rad].
+
+    Draws lie in $[-\pi/2, \pi/2)$. Every real number is a heading, with density $1/\pi$
+    wherever it lies, so that a sampler moves on without meeting an edge; its draws are
+    to be read modulo $\pi$. An interval with ends would cut a mode near them in two.
+    """
+
+    arg_constraints: dict = {}  # noqa: RUF012 as NumPyro declares it
+    support = constraints.real
+
+    def __init__(self):
+        super().__init__(batch_shape=(), event_shape=())
+
+    def sample(self, key: Any, sample_shape: tuple[int, ...] = ()) -> Array:
+        """Draw headings."""
+        uniform = jax.random.uniform(key, sample_shape)
+        return math.pi * (uniform - 0.5)
+
+    def log_prob(self, value: Any, intermediates: Any = None) -> Array:
+        """Log-density, the same everywhere."""
+        return jnp.full(jnp.shape(value), -math.log(math.pi))
+
+
+# Name of each number, its entry in the prior, first coordinate within the slot, count.
+_NUMBERS: dict[str, tuple[tuple[str, str, int, int], ...]] = {
+    "revolute": (
+        ("anchor_a", "revolute.anchor", 0, 2),
+        ("anchor_b", "revolute.anchor", 2, 2),
+        ("viscous_rate", "revolute.viscous_rate", 4, 1),
+        ("dry_share", "revolute.dry_share", 5, 1),
+    ),
+    "distance": (
+        ("anchor_a", "distance.anchor", 0, 2),
+        ("anchor_b", "distance.anchor", 2, 2),
+        ("length", "distance.length", 4, 1),
+    ),
+    "wheel": (
+        ("position", "wheel.position", 0, 2),
+        ("heading", "", 2, 1),
+        ("lateral_rate", "wheel.lateral_rate", 3, 1),
+        ("lateral_limit", "wheel.lateral_limit", 4, 1),
+        ("viscous_ratio", "wheel.viscous_ratio", 5, 1),
+        ("dry_ratio", "wheel.dry_ratio", 6, 1),
+        ("half_track", "wheel.half_track", 7, 1),
+    ),
+    "ground": (
+        ("dry", "ground.friction", 0, 1),
+        ("knee_speed", "ground.knee_speed", 1, 1),
+        ("torque_share", "ground.torque_share", 2, 1),
+        ("load_shift", "ground.load_shift", 3, 2),
+    ),
+}
+_LOGISTIC = ("wheel.viscous_ratio", "wheel.dry_ratio", "ground.torque_share")
+
+
+def block_sites(block: Block, names: tuple[str, ...]) -> tuple[Site, ...]:
+    """Sample sites of a block in its one structure.
+
+    A number that the scene gives has no site; of a pair of which it gives one, the
+    other is a site of its own, `anchor_a[1]`.
+
+    Args:
+        block: as `structure_blocks` makes it.
+        names: of its bodies.
+
+    Returns:
+        Sites; every coordinate on which the hypothesis depends belongs to one.
+    """
+    likelihood: Any = block.target.log_likelihood
+    scales = likelihood.coordinates.scales
+    is_free = _free_coordinates(likelihood.coordinates)
+    sites = [
+        Site(
+            f"{name}.density",
+            (index,),
+            "log",
+            scales.center["density"],
+            scales.spread["density"],
+        )
+        for index, name in enumerate(names)
+    ]
+    for slot, name in slot_names(names, block.layout).items():
+        sites += _slot_sites(slot, name, likelihood.coordinates)
+    kept = []
+    for site in sites:
+        free = [place for place, c in enumerate(site.coordinates) if is_free[c]]
+        if len(free) == len(site.coordinates):
+            kept.append(site)
+        else:
+            kept += [
+                Site(
+                    f"{site.name}[{place}]",
+                    (site.coordinates[place],),
+                    site.link,
+                    site.loc[place],
+                    site.scale[place],
+                )
+                for place in free
+            ]
+    return tuple(kept)
+
+
+def _slot_sites(slot: SlotKey, name: str, coordinates: Any) -> list[Site]:
+    """Sites of all numbers of one slot."""
+    sites = []
+    for field, entry, first, count in _NUMBERS[slot.kind]:
+        places = tuple(range(slot.start + first, slot.start + first + count))
+        if field == "heading":
+            zero, one = jnp.zeros(()), jnp.ones(())
+            sites.append(Site(f"{name}.{field}", places, "half_turn", zero, one))
+            continue
+        center = coordinates.scales.center[entry]
+        spread = coordinates.scales.spread[entry]
+        origin, unit = _origin_and_unit(slot, field, coordinates.surroundings)
+        if entry in LOGARITHMIC:
+            link, loc, scale = "log", center + jnp.log(unit), spread
+        elif entry in _LOGISTIC:
+            link, loc, scale = "logit", center, spread
+        else:
+            link, loc, scale = "identity", origin + unit * center, unit * spread
+        if count > 1:
+            loc, scale = (jnp.broadcast_to(value, (count,)) for value in (loc, scale))
+        sites.append(Site(f"{name}.{field}", places, link, loc, scale))
+    return sites
+
+
+def _origin_and_unit(slot: SlotKey, field: str, around: Any) -> tuple[Array, Array]:
+    """Where a number is measured from, and in multiples of what."""
+    a, b = slot.body_a, slot.body_b
+    reach = around.radius + around.spread
+    zero, one = jnp.zeros(()), jnp.ones(())
+    if field == "anchor_b":
+        return (around.center[a], reach[a]) if b == WORLD else (zero, reach[b])
+    if field in ("anchor_a", "length"):
+        return zero, reach[a]
+    if field == "position":
+        return around.box_center[a], around.half_extents[a]
+    if field in ("half_track", "load_shift"):
+        return zero, around.radius[a]
+    return zero, one
+
+
+@jax.jit
+def _dependence(coordinates: Any, z: Array, active: Array) -> list[Array]:
+    """Derivative of every number of the hypothesis by every coordinate."""
+
+    def numbers(z: Array) -> list[Array]:
+        leaves = jax.tree.leaves(coordinates(z, active))
+        return [x.ravel() for x in leaves if jnp.issubdtype(x.dtype, jnp.floating)]
+
+    return jax.jacfwd(numbers)(z)
+
+
+def _free_coordinates(coordinates: Any) -> np.ndarray:
+    """Coordinates on which the hypothesis depends; the scene gives the others' part."""
+    layout = coordinates.layout
+    # Away from zero, where an anchor's arm would not change to first order.
+    z = jnp.full(layout.dim, 0.5)
+    derivatives = _dependence(coordinates, z, jnp.ones(len(layout.slots), bool))
+    return np.any([np.any(np.asarray(d) != 0, axis=0) for d in derivatives], axis=0)
