@@ -34,7 +34,6 @@ class CompileAhead:
         self._work = None if key in _done else work
         _done.add(key)
         self._pool: concurrent.futures.ThreadPoolExecutor | None = None
-        self._future: concurrent.futures.Future | None = None
 
     def __enter__(self) -> "CompileAhead":
         work = self._work
@@ -47,9 +46,8 @@ class CompileAhead:
                     return work()
 
             self._pool = concurrent.futures.ThreadPoolExecutor(1)
-            self._future = self._pool.submit(run)
+            self._pool.submit(run)
         return self
-
 
     def __exit__(self, *_: object) -> None:
         if self._pool is not None:

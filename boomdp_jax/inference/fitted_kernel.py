@@ -68,9 +68,13 @@ def structure_kernel(
         )
     block = make_block(spec, _choose_block(spec, history, bodies), history)
     names = tuple(spec.names[i] for i in block.bodies)
-    mixture, _ = fitted_mixture(key, block.target)
+    fitted = fitted_mixture(key, block.target)
+    block = block._replace(target=fitted.target)
     return StructureKernel(
-        block.target, mixture, settings, postprocess=NamedNumbers(block, names)
+        fitted.target,
+        fitted.mixture,
+        settings,
+        postprocess=NamedNumbers(block, names),
     )
 
 

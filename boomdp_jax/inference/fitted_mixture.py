@@ -5,23 +5,26 @@ structures with one slot less and the prior fill the gaps, and importance sampli
 the weights.
 """
 
-import equinox as eqx
+from typing import NamedTuple
+
 import jax
 
 from boomdp_jax.core.arrays import Key
-from boomdp_jax.inference.fit import FitSettings, Modes, fit_modes
-from boomdp_jax.inference.importance_evidence import (
-    ImportanceEvidence,
-    importance_evidence,
-)
+from boomdp_jax.inference.find_modes import find_modes
+from boomdp_jax.inference.fit import FitSettings
+from boomdp_jax.inference.importance_evidence import ImportanceEvidence
 from boomdp_jax.inference.laplace_mixture import LaplaceMixture
-from boomdp_jax.inference.mixture_building import (
-    add_prior_components,
-    add_slot_components,
-    laplace_mixture,
-    refine_weights,
-)
+from boomdp_jax.inference.sample import start_mixtures
 from boomdp_jax.inference.target import StructureTarget
+from boomdp_jax.inference.weighing import weigh_mixtures
+
+
+class FittedMixture(NamedTuple):
+    """A target with the gains of its fits, where to jump, and how odds stand."""
+
+    target: StructureTarget
+    mixture: LaplaceMixture
+    evidence: ImportanceEvidence
 
 
 def fitted_mixture(
@@ -30,36 +33,26 @@ def fitted_mixture(
     *,
     settings: FitSettings | None = None,
     num_importance: int = 2048,
-) -> tuple[LaplaceMixture, ImportanceEvidence]:
+) -> FittedMixture:
     """Fit every structure of one object and weigh what was found.
 
     Args:
         key: random key.
-        target: with a `OneStepLikelihood`.
+        target: with a `FilteredLikelihood`, as `make_block` gives it.
         settings: how hard to look for modes.
         num_importance: draws that weigh components and structures.
 
     Returns:
-        A mixture with components for every structure, and the evidence.
+        The target with filters, a mixture with components for every structure, and the
+        evidence.
     """
     fit_key, importance_key = jax.random.split(key)
     stacked = jax.tree.map(lambda leaf: leaf[None], target)
-    modes = fit_modes(fit_key, stacked, settings)
-    modes = jax.tree.map(lambda leaf: leaf[0], modes)
-    return _weighed(importance_key, target, modes, num_importance)
-
-
-@eqx.filter_jit
-def _weighed(
-    key: Key, target: StructureTarget, modes: Modes, num_importance: int
-) -> tuple[LaplaceMixture, ImportanceEvidence]:
-    mixture = laplace_mixture(
-        target, modes.structure, modes.z, modes.precision, modes.log_density
+    settings = FitSettings() if settings is None else settings
+    found = find_modes(fit_key, stacked, settings)
+    mixtures = start_mixtures(found.targets, found.modes)
+    mixtures, evidence = weigh_mixtures(
+        importance_key, found.targets, mixtures, num_importance
     )
-    mixture = add_slot_components(target, mixture, total_weight=0.4)
-    mixture = add_prior_components(target, mixture, total_weight=0.02)
-    evidence = importance_evidence(key, target, mixture, num_importance)
-    mixture = refine_weights(
-        target, mixture, evidence.structure, evidence.z, evidence.log_weight
-    )
-    return mixture, evidence
+    every = FittedMixture(found.targets, mixtures, evidence)
+    return jax.tree.map(lambda leaf: leaf[0], every)

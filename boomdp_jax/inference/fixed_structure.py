@@ -143,10 +143,13 @@ def _as_inferred(block: Block, num_known: int) -> Block:
     layout = layout._replace(slots=layout.slots + added, known_slots=kept)
     likelihood: Any = block.target.log_likelihood
     coordinates = dataclasses.replace(likelihood.coordinates, layout=layout)
+    structures = jnp.ones((1, len(layout.slots)), bool)
     target = dataclasses.replace(
         block.target,
-        log_likelihood=dataclasses.replace(likelihood, coordinates=coordinates),
-        structures=jnp.ones((1, len(layout.slots)), bool),
+        log_likelihood=dataclasses.replace(
+            likelihood, coordinates=coordinates, structures=structures
+        ),
+        structures=structures,
         log_prior=jnp.zeros(1),
         slot=jnp.asarray(layout.slot_of_coordinate(), jnp.int32),
     )

@@ -152,7 +152,7 @@ class ObjectModel(eqx.Module):
     def _readings(self, block: Block, history: History | None) -> Readings:
         if history is None:
             likelihood: Any = block.target.log_likelihood
-            return likelihood.data
+            return likelihood.data.steps
         return readings(history, block.bodies, is_uniform=False)
 
 

@@ -21,14 +21,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from boomdp_jax.core.arrays import Key
-from boomdp_jax.inference.evaluate import evaluate_points
 from boomdp_jax.inference.importance_evidence import (
     ImportanceEvidence,
-    draws_of_noise,
-    weigh_draws,
 )
 from boomdp_jax.inference.laplace_mixture import LaplaceMixture
-from boomdp_jax.inference.mixture_building import fit_spare_components, refine_weights
+from boomdp_jax.inference.mixture_building import fit_spare_components
 from boomdp_jax.inference.moves import (
     MOVES,
     MoveInfo,
@@ -38,9 +35,10 @@ from boomdp_jax.inference.moves import (
     propose_change,
     propose_walk,
 )
-from boomdp_jax.inference.noise import Noise, host_generator, host_noise, pick
+from boomdp_jax.inference.noise import Noise, host_generator, pick
 from boomdp_jax.inference.structure_chain import ChainDraws
 from boomdp_jax.inference.target import StructureTarget
+from boomdp_jax.inference.weighing import batch_noise, evaluate_each, weigh_twice
 
 # Moves of one sweep, by name.
 _CYCLE = ("jump", "walk", "change", "walk", "jump")
@@ -104,11 +102,11 @@ def sample_population(
     Returns:
         Draws of every chain, move counts, and evidence by importance sampling.
     """
-    evaluate = _evaluate if evaluate is None else evaluate
+    evaluate = evaluate_each if evaluate is None else evaluate
     rng = host_generator(key)
-    evidence = _weigh(rng, targets, mixtures, settings.num_importance, evaluate)
-    mixtures = _refine(targets, mixtures, evidence)
-    evidence = _weigh(rng, targets, mixtures, settings.num_importance, evaluate)
+    mixtures, evidence = weigh_twice(
+        rng, targets, mixtures, settings.num_importance, evaluate
+    )
     points = _start(evidence, targets, mixtures, settings)
     num_objects = targets.structures.shape[0]
     step_size = np.full(num_objects, 0.5)
@@ -136,62 +134,6 @@ def sample_population(
         counts=MoveCounts(proposed, accepted),
         evidence=evidence,
     )
-
-
-@eqx.filter_jit
-def _draw(offset, noise, targets: StructureTarget, mixtures: LaplaceMixture):
-    return jax.vmap(draws_of_noise)(offset, noise, targets, mixtures)
-
-
-@eqx.filter_jit
-def _weigh_all(targets: StructureTarget, draws, log_density):
-    return jax.vmap(weigh_draws)(targets, draws, log_density)
-
-
-def _weigh(
-    rng: np.random.Generator,
-    targets: StructureTarget,
-    mixtures: LaplaceMixture,
-    num_draws: int,
-    evaluate: Callable[..., Array],
-) -> ImportanceEvidence:
-    """Draw from mixtures and weigh the draws."""
-    num_objects = targets.structures.shape[0]
-    noise = _noise(rng, targets, mixtures, num_draws)
-    offset = jnp.asarray(rng.random(num_objects), noise.normal.dtype)
-    draws = _draw(offset, noise, targets, mixtures)
-    return _weigh_all(targets, draws, evaluate(targets, draws.structure, draws.z))
-
-
-def _noise(
-    rng: np.random.Generator,
-    targets: StructureTarget,
-    mixtures: LaplaceMixture,
-    num: int,
-) -> Noise:
-    """Random numbers for as many proposals of every object."""
-    num_objects, dim = targets.slot.shape
-    dtype = np.dtype(targets.log_prior.dtype)
-    return host_noise(rng, (num_objects, num), dim, mixtures.degrees_of_freedom, dtype)
-
-
-def _evaluate(targets: StructureTarget, structure, z) -> Float[Array, "object point"]:
-    """Log-densities of as many points of every object."""
-    num_objects, num = structure.shape
-    found = evaluate_points(
-        targets,
-        np.repeat(np.arange(num_objects), num),
-        np.asarray(structure).reshape(-1),
-        np.asarray(z).reshape(num_objects * num, -1),
-    )
-    return jnp.asarray(found.log_density.reshape(num_objects, num))
-
-
-@eqx.filter_jit
-def _refine(targets: StructureTarget, mixtures: LaplaceMixture, evidence):
-    return jax.vmap(
-        lambda t, m, e: refine_weights(t, m, e.structure, e.z, e.log_weight)
-    )(targets, mixtures, evidence)
 
 
 @eqx.filter_jit
@@ -350,7 +292,7 @@ def _proposals(
     step_size: np.ndarray,
 ) -> _Batch:
     """A proposal of every walker."""
-    noise = _noise(rng, targets, mixtures, points.structure.shape[1])
+    noise = batch_noise(rng, targets, mixtures, points.structure.shape[1])
     size = jnp.asarray(step_size, points.z.dtype)
     return _propose(move, noise, points, targets, mixtures, size)
 

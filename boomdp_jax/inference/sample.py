@@ -16,6 +16,7 @@ from boomdp_jax.inference.evaluate import evaluate_points
 from boomdp_jax.inference.find_modes import Found, find_modes
 from boomdp_jax.inference.fit import FitSettings, Modes
 from boomdp_jax.inference.fit_noise import NoiseFit, filter_points
+from boomdp_jax.inference.laplace_mixture import LaplaceMixture
 from boomdp_jax.inference.mixture_building import (
     add_prior_components,
     add_slot_components,
@@ -74,7 +75,7 @@ class BlockDraws(NamedTuple):
 
 
 @eqx.filter_jit
-def _mixtures(targets: StructureTarget, modes):
+def start_mixtures(targets: StructureTarget, modes: Modes) -> LaplaceMixture:
     """Proposal mixtures: fitted modes, modes times priors, and the prior."""
 
     def one(target, modes):
@@ -113,7 +114,7 @@ def sample_blocks(
         found: Found = find_modes(fit_key, targets, settings.fit, report)
     targets = found.targets
     report("jumping between structures")
-    mixtures = _mixtures(targets, found.modes)
+    mixtures = start_mixtures(targets, found.modes)
     population = sample_population(chain_key, targets, mixtures, settings.population)
     draws, evidence = population.draws, population.evidence
     num_objects = targets.structures.shape[0]
@@ -159,7 +160,7 @@ def _rehearse(key: Key, targets: StructureTarget, settings: SampleSettings) -> N
     sample_population(
         key,
         targets,
-        _mixtures(targets, modes),
+        start_mixtures(targets, modes),
         settings.population._replace(num_warmup=1, num_sweeps=1),
         evaluate=lambda targets, structure, z: jnp.zeros(structure.shape, dtype),
     )

@@ -1,0 +1,111 @@
+"""Weights of mixtures and evidence of structures, for batches of objects."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from boomdp_jax.core.arrays import Key
+from boomdp_jax.inference.evaluate import evaluate_points
+from boomdp_jax.inference.importance_evidence import (
+    ImportanceEvidence,
+    draws_of_noise,
+    weigh_draws,
+)
+from boomdp_jax.inference.laplace_mixture import LaplaceMixture
+from boomdp_jax.inference.mixture_building import refine_weights
+from boomdp_jax.inference.noise import Noise, host_generator, host_noise
+from boomdp_jax.inference.target import StructureTarget
+
+
+def weigh_mixtures(
+    key: Key, targets: StructureTarget, mixtures: LaplaceMixture, num_draws: int
+) -> tuple[LaplaceMixture, ImportanceEvidence]:
+    """Set weights of mixtures by importance sampling, and weigh structures with them.
+
+    Args:
+        key: random key.
+        targets: with a `FilteredLikelihood`, stacked along a leading object axis.
+        mixtures: one of each object.
+        num_draws: for the weights, and as many again for the evidence.
+
+    Returns:
+        Mixtures with other weights, and the evidence of every object.
+    """
+    return weigh_twice(host_generator(key), targets, mixtures, num_draws, evaluate_each)
+
+
+def weigh_twice(
+    rng: np.random.Generator,
+    targets: StructureTarget,
+    mixtures: LaplaceMixture,
+    num_draws: int,
+    evaluate: Callable[..., Array],
+) -> tuple[LaplaceMixture, ImportanceEvidence]:
+    """The same with another source of randomness and of log-densities."""
+    evidence = _weigh(rng, targets, mixtures, num_draws, evaluate)
+    mixtures = _refine(targets, mixtures, evidence)
+    return mixtures, _weigh(rng, targets, mixtures, num_draws, evaluate)
+
+
+@eqx.filter_jit
+def _draw(offset, noise, targets: StructureTarget, mixtures: LaplaceMixture):
+    return jax.vmap(draws_of_noise)(offset, noise, targets, mixtures)
+
+
+@eqx.filter_jit
+def _weigh_all(targets: StructureTarget, draws, log_density):
+    return jax.vmap(weigh_draws)(targets, draws, log_density)
+
+
+def _weigh(
+    rng: np.random.Generator,
+    targets: StructureTarget,
+    mixtures: LaplaceMixture,
+    num_draws: int,
+    evaluate: Callable[..., Array],
+) -> ImportanceEvidence:
+    """Draw from mixtures and weigh the draws."""
+    num_objects = targets.structures.shape[0]
+    noise = batch_noise(rng, targets, mixtures, num_draws)
+    offset = jnp.asarray(rng.random(num_objects), noise.normal.dtype)
+    draws = _draw(offset, noise, targets, mixtures)
+    return _weigh_all(targets, draws, evaluate(targets, draws.structure, draws.z))
+
+
+def batch_noise(
+    rng: np.random.Generator,
+    targets: StructureTarget,
+    mixtures: LaplaceMixture,
+    num: int,
+) -> Noise:
+    """Random numbers for as many proposals of every object."""
+    num_objects, dim = targets.slot.shape
+    dtype = np.dtype(targets.log_prior.dtype)
+    return host_noise(rng, (num_objects, num), dim, mixtures.degrees_of_freedom, dtype)
+
+
+def evaluate_each(
+    targets: StructureTarget,
+    structure: Int[Array, "object point"],
+    z: Float[Array, "object point dim"],
+) -> Float[Array, "object point"]:
+    """Log-densities of as many points of every object."""
+    num_objects, num = structure.shape
+    found = evaluate_points(
+        targets,
+        np.repeat(np.arange(num_objects), num),
+        np.asarray(structure).reshape(-1),
+        np.asarray(z).reshape(num_objects * num, -1),
+    )
+    return jnp.asarray(found.log_density.reshape(num_objects, num))
+
+
+@eqx.filter_jit
+def _refine(targets: StructureTarget, mixtures: LaplaceMixture, evidence):
+    return jax.vmap(
+        lambda t, m, e: refine_weights(t, m, e.structure, e.z, e.log_weight)
+    )(targets, mixtures, evidence)
