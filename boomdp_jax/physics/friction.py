@@ -23,8 +23,12 @@ from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.physics.params import Ground, Params, Wheel
 from boomdp_jax.physics.scene import Scene
-from boomdp_jax.physics.small_linear import dot3, matvec3
 from boomdp_jax.physics.trigonometry import sincos
+
+# Newton steps after the solution in which everything sticks. Of 20,000 random bodies
+# with pin, wheels and feet (active or not) 99.9 % are then right to 1e-9 m/s, after
+# four to 2e-4; after three, one in a thousand is wrong by 0.3 m/s.
+NUM_NEWTON = 5
 
 PerContact = Float[Array, "*contact"]
 
@@ -68,12 +72,17 @@ class _Points(NamedTuple):
     active: Bool[Array, "*contact"]
 
 
+def wheel_headings(wheel: Wheel) -> PerContact:
+    """Heading of every wheel `[wheel, body]`, zero where it is not active [rad]."""
+    return jnp.where(wheel.active, wheel.heading, 0.0).T
+
+
 def _wheel_points(wheel: Wheel) -> _Points:
     """One contact, or two with half the coefficients where there is a track."""
     points = _Points(
         x=wheel.position[..., 0].T,
         y=wheel.position[..., 1].T,
-        heading=wheel.heading.T,
+        heading=wheel_headings(wheel),
         viscous=(wheel.viscous[..., 0].T, wheel.viscous[..., 1].T),
         dry=(wheel.dry[..., 0].T, wheel.dry[..., 1].T),
         active=wheel.active.T,
@@ -189,105 +198,42 @@ def joint_spin(viscous: Array, dry: Array, active: Array) -> Spin:
     return Spin(viscous=c, knee=_over(c, dry), weight=jnp.ones_like(c))
 
 
-def implicit_weight(decay: Float[Array, "..."]) -> Float[Array, "..."]:
-    r"""Share of the end velocity that makes a step exact for linear decay.
+def is_reversed(ratio: tuple, before: tuple) -> Bool[Array, "..."]:
+    """Whether Newton's method took a slipping contact beyond rest.
 
-    With $z$ the decay over a step (rate times length), a step that applies friction at
-    $\vartheta u' + (1-\vartheta) u$ multiplies a velocity by
-    $(1-(1-\vartheta)z)/(1+\vartheta z)$. For $\vartheta = 1/(1-e^{-z}) - 1/z$ this
-    is $e^{-z}$, and the response to a constant force is exact too. It tends to 1/2
-    (second order) where friction is slow and to 1 (backward Euler, no overshoot) where
-    it is stiff. Exponential fitting: Liniger and Willoughby (1970), SIAM J. Numer.
-    Anal. 7, 47.
-    """
-    is_small = decay < 0.05
-    z = jnp.where(is_small, 1.0, decay)
-    exact = -1.0 / jnp.expm1(-z) - 1.0 / z
-    return jnp.where(is_small, 0.5 + decay / 12.0, exact)
-
-
-def fit_weights(
-    contacts: Contact | None, spins: Spin | None, inverse, mass, inertia, mobile, length
-) -> tuple[Contact | None, Spin | None]:
-    """Turn forces into impulses, bound their stiffness, and fit the blend weights.
-
-    In single precision a stiffness beyond `bound` times the inertia would drown the
-    inertia in rounding, so it is held there: what is left of the velocity after a step
-    is then one part in `bound`.
+    Beyond, the law bends the other way, and the next step would lead back: where two
+    kinks face each other that repeats for ever. Such a contact is taken as sticking for
+    one iteration, whose solution then tells on which side it belongs. Of 20,000 random
+    hypotheses with decoupled ground torque one in 160 else never converged.
 
     Args:
-        contacts: from `friction_points`.
-        spins: likewise.
-        inverse: twist per impulse in the body frame, 3 x 3 entries per body.
-        mass: of each body [kg].
-        inertia: of each body [kg m²].
-        mobile: one for bodies that move, zero for static ones.
-        length: of the step [s].
+        ratio: speeds over those at which the limits are reached, now.
+        before: the same in the iteration before.
 
     Returns:
-        Both, coefficients times the length of the step.
+        Whether it slipped before and moves against its own direction now.
     """
-    bound = 1e-4 / jnp.finfo(mass.dtype).eps
-    zero = jnp.zeros_like(mass)
-    damping = [[zero] * 3 for _ in range(3)]
-
-    def bounded(viscous, knee, ease):
-        new = mobile[None] * jnp.minimum(length * viscous, bound / ease)
-        whole = jnp.where(viscous > 0, length * viscous, 1.0)
-        return new, knee * new / whole
-
-    def plain_ease(row):
-        return (row[0] ** 2 + row[1] ** 2) / mass[None] + row[2] ** 2 / inertia[None]
-
-    if contacts is not None:
-        rows = (contacts.rolling, contacts.lateral)
-        pairs = [
-            bounded(c, g, plain_ease(row))
-            for c, g, row in zip(contacts.viscous, contacts.knee, rows, strict=True)
-        ]
-        contacts = contacts._replace(
-            viscous=tuple(p[0] for p in pairs), knee=tuple(p[1] for p in pairs)
-        )
-        for row, v in zip(rows, contacts.viscous, strict=True):
-            damping = [
-                [damping[i][j] + jnp.sum(v * row[i] * row[j], axis=0) for j in range(3)]
-                for i in range(3)
-            ]
-    if spins is not None:
-        viscous, knee = bounded(spins.viscous, spins.knee, 1.0 / inertia[None])
-        spins = spins._replace(viscous=viscous, knee=knee)
-        damping[2][2] = damping[2][2] + jnp.sum(viscous, axis=0)
-    inverse = [[entry[None] for entry in row] for row in inverse]
-    damping = [[entry[None] for entry in row] for row in damping]
-
-    def weight(row):
-        push = matvec3(inverse, row)
-        ease = dot3(row, push)
-        is_free = ease > 1e-6 * plain_ease(row)
-        decay = dot3(push, matvec3(damping, push)) / jnp.where(is_free, ease, 1.0)
-        return implicit_weight(jnp.where(is_free, decay, 0.0))
-
-    if contacts is not None:
-        contacts = contacts._replace(weight=tuple(weight(row) for row in rows))
-    if spins is not None:
-        none = jnp.zeros_like(spins.viscous)
-        spins = spins._replace(weight=weight((none, none, none + 1.0)))
-    return contacts, spins
+    along = sum(r * b for r, b in zip(ratio, before, strict=True))
+    return (along < 0.0) & (sum(b * b for b in before) > 1.0)
 
 
-def limited(u: tuple, viscous: tuple, knee: tuple):
+def limited(u: tuple, viscous: tuple, knee: tuple, before: tuple | None = None):
     """Scale of the viscous force, and the derivative K of the force.
 
     Args:
         u: contact velocity, one or two components [m/s].
         viscous: C, as many.
         knee: C over D, as many.
+        before: u in the iteration before, if there is one (see `is_reversed`).
 
     Returns:
         The scale min(1, 1/s), and K as rows of entries.
     """
     ratio = [g * x for g, x in zip(knee, u, strict=True)]
     square = sum(r * r for r in ratio)
+    if before is not None:
+        old = [g * x for g, x in zip(knee, before, strict=True)]
+        square = jnp.where(is_reversed(tuple(ratio), tuple(old)), 1.0, square)
     is_slip = square > 1.0
     scale = jnp.where(is_slip, 1.0 / jnp.sqrt(jnp.where(is_slip, square, 1.0)), 1.0)
     inverse_square = jnp.where(is_slip, scale * scale, 0.0)

@@ -15,8 +15,9 @@ $g = 1/(m\,r \cdot r' + I)$. Without a pin r = 0, l = 1/m and g = 1/I say the sa
 free body: one code for both, no elimination of joint rows, and no softness to keep
 redundant rows solvable.
 
-Bringing poses and twists back onto the pin is closed as well: the smallest change in
-kinetic energy moves the anchor where it belongs and has no momentum about it.
+The frame that is called the body's here is turned to the heading of its first wheel:
+that wheel then needs no rotation, and feet, which rub alike in every direction, never
+do. All that does not change from step to step is worked out here.
 """
 
 from typing import NamedTuple
@@ -27,12 +28,10 @@ import jax.numpy as jnp
 from boomdp_jax.core.arrays import FloatScalar
 from boomdp_jax.core.holding import hold, runtime_one
 from boomdp_jax.physics.friction import Contact, Spin
+from boomdp_jax.physics.implicit_fit import Groups
 from boomdp_jax.physics.joints import Slot
-from boomdp_jax.physics.lone_friction import Brake, Drag, SlidingProblem, solve_sliding
-from boomdp_jax.physics.motion import Motion
-from boomdp_jax.physics.trigonometry import sincos
-
-Pair = tuple[FloatScalar, ...]
+from boomdp_jax.physics.lone_contacts import Feet, Pair, Track, into, turned
+from boomdp_jax.physics.lone_friction import Brake, Stuck
 
 
 class Pivot(NamedTuple):
@@ -40,27 +39,13 @@ class Pivot(NamedTuple):
 
     active: FloatScalar
     anchor: Pair
-    """r: anchor in the body frame [m]."""
+    """r: anchor in the body's (turned) frame [m]."""
     world: Pair
     """Where it is to be [m]."""
     mobile: FloatScalar
     """One if it is active and its body can move."""
     levelling: FloatScalar
     """Turn that puts right an anchor off by one metre at a lever of one [rad/m²]."""
-
-
-class LoneContact(NamedTuple):
-    """A contact in scalars; see `friction.Contact`."""
-
-    rolling: Pair
-    lateral: Pair
-    lever: Pair
-    """Rolling and lateral velocity per spin about the centre of mass [m]."""
-    arm: Pair
-    """The same about the anchor [m]."""
-    viscous: Pair
-    knee: Pair
-    weight: Pair
 
 
 class LoneBody(NamedTuple):
@@ -72,13 +57,18 @@ class LoneBody(NamedTuple):
     inertia: FloatScalar
     weight: Pair
     """Impulse of gravity over a step [N s]."""
+    facing: FloatScalar
+    """Heading of the first wheel [rad], of which "the body's frame" is turned."""
     ease: FloatScalar
     """l: velocity of the anchor per impulse [1/kg]."""
-    contacts: list[LoneContact]
-    torques: list[Spin]
+    tracks: list[Track]
+    feet: list[Feet]
+    brakes: list[Brake]
     """Friction against spin, from the floor."""
-    joint: Spin | None
+    joint: Brake | None
     """Friction of the pin."""
+    stuck: Stuck | None
+    """None where at most one contact and no torque from the floor act."""
     pivot: Pivot | None
 
 
@@ -89,6 +79,8 @@ def lone_body(
     inertia: FloatScalar,
     weight: Pair,
     contacts: Contact | None,
+    groups: Groups,
+    facing: FloatScalar,
     spins: Spin | None,
     pins: list[Slot],
 ) -> LoneBody:
@@ -100,7 +92,9 @@ def lone_body(
         mass: of the body [kg].
         inertia: about the centre of mass [kg m²].
         weight: impulse of gravity over a step [N s].
-        contacts: points of friction, fitted (`friction.fit_weights`).
+        contacts: points of friction, fitted (`implicit_fit.fit_weights`).
+        groups: which of them belong together.
+        facing: heading of the first wheel, zero where there is none [rad].
         spins: frictions against spin, fitted; the pin's last.
         pins: none or one.
 
@@ -108,32 +102,63 @@ def lone_body(
         All that the time loop needs, each number computed once.
     """
     zero, pivot, ease = jnp.zeros_like(mass), None, mobile / mass
-    anchor = (zero, zero)
+    one = runtime_one(mass)
+
+    def held(values):
+        return jax.tree.map(lambda leaf: hold(leaf, one), values)
+
+    axis = None
+    if groups.num_wheels:
+        assert contacts is not None
+        axis = (contacts.rolling[0][0], contacts.rolling[1][0])
+    anchor = turned_anchor = (zero, zero)
     if pins:
         (pin,) = pins
         anchor = (pin.active * pin.anchor_a[0], pin.active * pin.anchor_a[1])
+        turned_anchor = into(axis, *anchor)
         square = anchor[0] ** 2 + anchor[1] ** 2
         levelling = pin.active * mobile * mass / (mass * square + inertia)
-        pivot = Pivot(pin.active, anchor, pin.anchor_b, pin.active * mobile, levelling)
+        pivot = held(
+            Pivot(
+                pin.active,
+                turned_anchor,
+                pin.anchor_b,
+                pin.active * mobile,
+                levelling,
+            )
+        )
         ease = (1.0 - pin.active) * ease
-    torques = [] if spins is None else _parts(spins)
-    body = LoneBody(
+    parts = [] if contacts is None else _parts(contacts)
+    num_wheels = groups.num_wheels * groups.num_sides
+    tracks = [
+        _track(parts[slot : num_wheels : groups.num_wheels], anchor, axis, slot == 0)
+        for slot in range(groups.num_wheels)
+    ]
+    feet = [
+        _feet(parts[first : first + groups.num_feet], anchor, axis)
+        for first in range(num_wheels, len(parts), groups.num_feet)
+    ]
+    brakes = [Brake(*spin) for spin in ([] if spins is None else _parts(spins))]
+    tracks, feet, brakes = held((tracks, feet, brakes))
+    floor = brakes[: len(brakes) - len(pins)]
+    stuck = None
+    if len(parts) > 1 or floor:
+        stuck = held(jax.lax.stop_gradient(_stuck(tracks, feet, brakes, zero)))
+    return LoneBody(
         length=length,
         mobile=mobile,
-        mass=mass,
-        inertia=inertia,
-        weight=weight,
-        ease=ease,
-        contacts=[
-            _lone_contact(part, anchor)
-            for part in ([] if contacts is None else _parts(contacts))
-        ],
-        torques=torques[: len(torques) - len(pins)],
-        joint=torques[-1] if pins else None,
+        mass=held(mass),
+        inertia=held(inertia),
+        weight=held(weight),
+        facing=facing,
+        ease=held(ease),
+        tracks=tracks,
+        feet=feet,
+        brakes=floor,
+        joint=brakes[-1] if pins else None,
+        stuck=stuck,
         pivot=pivot,
     )
-    one = runtime_one(mass)
-    return jax.tree.map(lambda leaf: leaf if leaf is length else hold(leaf, one), body)
 
 
 def _parts(stacked):
@@ -141,159 +166,61 @@ def _parts(stacked):
     return [jax.tree.map(lambda leaf, i=i: leaf[i], stacked) for i in range(num)]
 
 
-def _lone_contact(contact: Contact, anchor: Pair) -> LoneContact:
-    rows = (contact.rolling, contact.lateral)
-    return LoneContact(
-        rolling=contact.rolling[:2],
-        lateral=contact.lateral[:2],
-        lever=tuple(row[2] for row in rows),
-        arm=tuple(row[2] + anchor[1] * row[0] - anchor[0] * row[1] for row in rows),
-        viscous=contact.viscous,
-        knee=contact.knee,
-        weight=contact.weight,
+def _track(
+    wheels: list[Contact], anchor: Pair, axis: Pair | None, is_first: bool
+) -> Track:
+    """Contacts of one wheel slot."""
+
+    def arm(row):
+        return row[2] + anchor[1] * row[0] - anchor[0] * row[1]
+
+    wheel = wheels[0]
+    return Track(
+        heading=None if is_first else into(axis, *wheel.rolling[:2]),
+        reach=[arm(wheel.rolling) for wheel in wheels],
+        lead=arm(wheel.lateral),
+        viscous=wheel.viscous,
+        knee=wheel.knee,
+        share=wheel.weight,
     )
 
 
-def lone_substep(body: LoneBody, motion: Motion, force: tuple) -> Motion:
-    """Advance by one substep; the stages are those of `step`.
-
-    Args:
-        body: what is prepared.
-        motion: before.
-        force: world frame, at the centre of mass [N, N, N m].
-
-    Returns:
-        The motion after the substep.
-    """
-    h, mobile, one = body.length, body.mobile, runtime_one(body.mass)
-    vx, vy, spin = (mobile * v for v in motion[3:])
-    half_turn = 0.5 * h * spin
-    sin, cos = (hold(v, one) for v in sincos(motion.theta + half_turn))
-    turn = tuple(hold(v, one) for v in sincos(half_turn))
-    impulse_x = body.mass * vx + mobile * (h * force[0] + body.weight[0])
-    impulse_y = body.mass * vy + mobile * (h * force[1] + body.weight[1])
-    momentum = (
-        hold(cos * impulse_x + sin * impulse_y, one),
-        hold(cos * impulse_y - sin * impulse_x, one),
-        body.inertia * spin + mobile * h * force[2],
-    )
-    start = (hold(cos * vx + sin * vy, one), hold(cos * vy - sin * vx, one), spin)
-    problem = _sliding_problem(body, momentum, start, turn, one)
-    wx, wy, new_spin = solve_sliding(problem, one)
-    if body.pivot is not None:
-        (x, y), (sin_half, cos_half) = body.pivot.anchor, turn
-        wx, wy = (
-            wx + (sin_half * x + cos_half * y) * new_spin,
-            wy - (cos_half * x - sin_half * y) * new_spin,
-        )
-    new_vx, new_vy = cos * wx - sin * wy, sin * wx + cos * wy
-    moved = Motion(
-        hold(motion.x + 0.5 * h * (vx + new_vx), one),
-        hold(motion.y + 0.5 * h * (vy + new_vy), one),
-        hold(motion.theta + 0.5 * h * (spin + new_spin), one),
-        hold(new_vx, one),
-        hold(new_vy, one),
-        new_spin,
-    )
-    return moved if body.pivot is None else _project(body.pivot, moved, one)
-
-
-def _sliding_problem(
-    body: LoneBody, momentum: tuple, start: tuple, turn: Pair, one: FloatScalar
-) -> SlidingProblem:
-    """Friction and momentum in terms of the anchor's velocity and the spin."""
-    sin, cos = turn
-    # The velocity at the start in the frame half a turn earlier, where wheels were.
-    early = (cos * start[0] - sin * start[1], sin * start[0] + cos * start[1])
-    drags = []
-    for contact in body.contacts:
-        rows = (contact.rolling, contact.lateral)
-        drags.append(
-            Drag(
-                force=tuple(
-                    (*row, arm) for row, arm in zip(rows, contact.arm, strict=True)
-                ),
-                # The contact's directions at the end, half a turn later.
-                speed=tuple(
-                    (
-                        share * (cos * row[0] - sin * row[1]),
-                        share * (sin * row[0] + cos * row[1]),
-                        share * arm,
-                    )
-                    for row, arm, share in zip(
-                        rows, contact.arm, contact.weight, strict=True
-                    )
-                ),
-                drift=tuple(
-                    (1.0 - share)
-                    * (row[0] * early[0] + row[1] * early[1] + lever * start[2])
-                    for row, lever, share in zip(
-                        rows, contact.lever, contact.weight, strict=True
-                    )
-                ),
-                viscous=contact.viscous,
-                knee=contact.knee,
-            )
-        )
-    drags = jax.tree.map(lambda v: hold(v, one), drags) if len(drags) > 1 else drags
-    push, inertia = momentum, body.inertia
-    if body.pivot is not None:
-        x, y = body.pivot.anchor
-        lever = momentum[2] + y * momentum[0] - x * momentum[1]
-        push = (momentum[0], momentum[1], lever)
-        inertia = inertia + body.mass * cos * (x * x + y * y)
-    return SlidingProblem(
-        push=push,
-        ease=(body.ease, 1.0 / inertia),
-        drags=drags,
-        brakes=[_brake(torque, start[2]) for torque in body.torques],
-        joint=None if body.joint is None else _brake(body.joint, start[2]),
+def _feet(feet: list[Contact], anchor: Pair, axis: Pair | None) -> Feet:
+    """Contacts of one ground slot; feet without load have no limits to tell of."""
+    knee = feet[0].knee[0]
+    for foot in feet[1:]:
+        knee = jnp.maximum(knee, foot.knee[0])
+    return Feet(
+        arms=[
+            into(axis, foot.rolling[2] + anchor[1], foot.lateral[2] - anchor[0])
+            for foot in feet
+        ],
+        viscous=[foot.viscous[0] for foot in feet],
+        knee=knee,
+        share=feet[0].weight[0],
     )
 
 
-def _brake(spin: Spin, start: FloatScalar) -> Brake:
-    drift = (1.0 - spin.weight) * start
-    return Brake(spin.weight, drift, spin.viscous, spin.knee)
+def _stuck(
+    tracks: list[Track], feet: list[Feet], brakes: list[Brake], zero: FloatScalar
+) -> Stuck:
+    """Sum over everything that rubs."""
+    end, start = [zero] * 9, [zero] * 9
 
+    def add(heading, c, d, p, q, shares):
+        for total, (w, z) in ((end, shares), (start, [1.0 - s for s in shares])):
+            f, g = c * w, d * z
+            part = (f, zero, f * p, zero, g, g * q, f * p, g * q, f * p * p + g * q * q)
+            part = turned(heading, part)
+            total[:] = [a + b for a, b in zip(total, part, strict=True)]
 
-def _project(pivot: Pivot, motion: Motion, one: FloatScalar) -> Motion:
-    """Bring the pose, then the twist, back onto the pin."""
-    x, y = pivot.anchor
-    sin, cos = (hold(v, one) for v in sincos(motion.theta))
-    dx, dy, dtheta = _level(pivot, *_offset(pivot, motion, sin, cos), one)
-    theta = hold(motion.theta + dtheta, one)
-    position = (motion.x + cos * dx - sin * dy, motion.y + sin * dx + cos * dy)
-    sin, cos = (hold(v, one) for v in sincos(theta))
-    slide_x = cos * motion.vx + sin * motion.vy - y * motion.spin
-    slide_y = cos * motion.vy - sin * motion.vx + x * motion.spin
-    dx, dy, dspin = _level(pivot, slide_x, slide_y, one)
-    return Motion(
-        hold(position[0], one),
-        hold(position[1], one),
-        theta,
-        hold(motion.vx + cos * dx - sin * dy, one),
-        hold(motion.vy + sin * dx + cos * dy, one),
-        hold(motion.spin + dspin, one),
-    )
-
-
-def _offset(pivot: Pivot, motion: Motion, sin, cos) -> Pair:
-    """How far off the anchor is, body frame [m]; zero if inactive."""
-    dx, dy = motion.x - pivot.world[0], motion.y - pivot.world[1]
-    on, (x, y) = pivot.active, pivot.anchor
-    return on * (cos * dx + sin * dy) + x, on * (cos * dy - sin * dx) + y
-
-
-def _level(pivot: Pivot, off_x, off_y, one: FloatScalar) -> tuple:
-    """Change of pose or twist that moves the anchor by minus an offset."""
-    x, y = pivot.anchor
-    off_x, off_y = (hold(pivot.mobile * off, one) for off in (off_x, off_y))
-    turn = hold(pivot.levelling * (y * off_x - x * off_y), one)
-    return y * turn - off_x, -x * turn - off_y, turn
-
-
-def lone_error(pivot: Pivot, motion: Motion) -> FloatScalar:
-    """Squared distance by which the pin fails to hold [m²]."""
-    sin, cos = sincos(motion.theta)
-    x, y = _offset(pivot, motion, sin, cos)
-    return x * x + y * y
+    for track in tracks:
+        for reach in track.reach:
+            add(track.heading, *track.viscous, reach, track.lead, track.share)
+    for patch in feet:
+        for (p, q), c in zip(patch.arms, patch.viscous, strict=True):
+            add(None, c, c, p, q, (patch.share, patch.share))
+    for brake in brakes:
+        end[8] = end[8] + brake.viscous * brake.share
+        start[8] = start[8] + brake.viscous * (1.0 - brake.share)
+    return Stuck(*(tuple(v[i] for i in (0, 1, 2, 4, 5, 8)) for v in (end, start)))

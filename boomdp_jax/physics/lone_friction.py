@@ -1,15 +1,18 @@
 r"""Friction of a lone body: three unknowns, whatever touches the floor.
 
-Unknown are the velocity of the anchor and the spin, $z = (s_x, s_y, \omega)$, in the
-coordinates of `lone_body`, in which the mass is diagonal:
+Unknown are the velocity of the anchor at the end of a step, in the body's frame there,
+and the spin, $e = (s_x, s_y, \omega)$, in the coordinates of `lone_body`, in which the
+mass is diagonal:
 
-$$z = L\,(P - F^T f(\bar u)), \qquad \bar u = S z + \beta, \qquad L = diag(l, l, g),$$
+$$R\,e = L\,(P - F^T f(\bar u)), \qquad \bar u = F(\Theta e + (1 - \Theta) e_0),
+  \qquad L = diag(l, l, g),$$
 
-with f the one friction law (`friction`), F its directions, S the same directions at
-the end of the step times the share of the end velocity, and $\beta$ what the velocity
-at the start contributes. One wheel is solved by one scalar equation (`lone_wheel`).
-Several contacts are solved by Newton's method from the solution in which all stick.
-Derivatives come from the implicit function theorem: one 3 x 3 system, in both modes.
+with f the one friction law (`friction`), F its directions in the body's frame, R the
+turn from the end of the step back to mid-step, where impulses act, and $\Theta$ the
+share of the end velocity. One wheel is solved by one scalar equation (`lone_wheel`).
+Several contacts are solved by Newton's method from the solution in which all stick,
+which is linear with coefficients that do not change (`Stuck`). Derivatives come from
+the implicit function theorem: one 3 x 3 system, in both modes.
 """
 
 from typing import NamedTuple
@@ -19,50 +22,59 @@ import jax.numpy as jnp
 
 from boomdp_jax.core.arrays import FloatScalar
 from boomdp_jax.core.holding import hold
+from boomdp_jax.physics.friction import NUM_NEWTON, is_reversed
+from boomdp_jax.physics.lone_contacts import (
+    Feet,
+    Motions,
+    Pair,
+    Track,
+    Triple,
+    blend,
+    feet_force,
+    feet_sums,
+    out_of,
+    slip_scale,
+    track_force,
+    track_sums,
+)
 from boomdp_jax.physics.lone_wheel import slipping_wheel
-from boomdp_jax.physics.small_linear import dot3, inverse3, matvec3, solve3
-
-Triple = tuple[FloatScalar, ...]
-
-# Newton steps after the sticking solution. Three bring one wheel or four feet to
-# rounding; more only cost.
-_NUM_NEWTON = 3
-
-
-class Drag(NamedTuple):
-    """Friction at a contact, in its two directions."""
-
-    force: tuple[Triple, ...]
-    """Rows of F: generalised force per force along each direction."""
-    speed: tuple[Triple, ...]
-    """Rows of S: velocity that friction sees, per generalised velocity."""
-    drift: tuple[FloatScalar, ...]
-    """Beta: what the start of the step contributes to it [m/s]."""
-    viscous: tuple[FloatScalar, ...]
-    """Impulse per speed [N s²/m]."""
-    knee: tuple[FloatScalar, ...]
-    """One over the speed at which the limit is reached [s/m]."""
+from boomdp_jax.physics.small_linear import inverse3, matvec3, solve3
 
 
 class Brake(NamedTuple):
     """Friction against spin."""
 
-    share: FloatScalar
-    """Share of the end spin in the spin that friction sees."""
-    drift: FloatScalar
-    """What the spin at the start contributes to it [rad/s]."""
     viscous: FloatScalar
     knee: FloatScalar
+    share: FloatScalar
+    """Share of the end spin in the spin that friction sees."""
+
+
+class Stuck(NamedTuple):
+    """Friction of everything that sticks, which is linear and never changes.
+
+    Symmetric, in entries xx, xy, xt, yy, yt, tt.
+    """
+
+    end: tuple
+    """Impulse per motion at the end, F^T C Theta F."""
+    start: tuple
+    """Impulse per motion at the start, F^T C (1 - Theta) F."""
 
 
 class SlidingProblem(NamedTuple):
     """Everything that the velocities at the end of a step depend on."""
 
     push: Triple
-    """P: what the momentum would be without friction."""
-    ease: tuple[FloatScalar, FloatScalar]
+    """P: what the momentum would be without friction, frame at mid-step."""
+    start: Triple
+    """Velocity of the anchor and spin at the start, in the body's frame there."""
+    ease: Pair
     """l and g: velocity of the anchor and spin per generalised impulse."""
-    drags: list[Drag]
+    turn: Pair
+    """Cosine and sine of the turn from mid-step to the end."""
+    tracks: list[Track]
+    feet: list[Feet]
     brakes: list[Brake]
     """Friction against spin from the floor."""
     joint: Brake | None
@@ -74,127 +86,116 @@ class SlidingProblem(NamedTuple):
         return self.brakes + ([] if self.joint is None else [self.joint])
 
 
-def slip_scale(square: FloatScalar) -> FloatScalar:
-    """What scales the viscous force back onto the limits, from s²: min(1, 1/s)."""
-    return 1.0 / jnp.sqrt(jnp.maximum(square, 1.0))
-
-
-def _slide(drag: Drag, z: Triple, one: FloatScalar):
-    """Velocity that friction sees, scale of the viscous force, and its loss by slip."""
-    u = tuple(
-        hold(dot3(row, z) + drift, one)
-        for row, drift in zip(drag.speed, drag.drift, strict=True)
-    )
-    square = (drag.knee[0] * u[0]) ** 2 + (drag.knee[1] * u[1]) ** 2
-    return u, slip_scale(square), square > 1.0
-
-
-def _turn(brake: Brake, z: Triple):
-    u = brake.share * z[2] + brake.drift
-    square = (brake.knee * u) ** 2
-    return u, slip_scale(square), square > 1.0
-
-
-def residual(problem: SlidingProblem, z: Triple, one: FloatScalar) -> Triple:
-    """Z - L (P - F^T f): zero at the solution."""
-    impulse = list(problem.push)
-    for drag in problem.drags:
-        u, scale, _ = _slide(drag, z, one)
-        for row, c, speed in zip(drag.force, drag.viscous, u, strict=True):
-            pull = scale * c * speed
-            impulse = [p - t * pull for p, t in zip(impulse, row, strict=True)]
+def residual(problem: SlidingProblem, e: Triple) -> Triple:
+    """R e - L (P - F^T f): zero at the solution."""
+    motions = Motions(e, problem.start)
+    forces = [track_force(track, motions) for track in problem.tracks]
+    forces += [feet_force(feet, motions) for feet in problem.feet]
+    x, y, moment = problem.push
+    for force in forces:
+        x, y, moment = x - force[0], y - force[1], moment - force[2]
     for brake in problem.all_brakes:
-        u, scale, _ = _turn(brake, z)
-        impulse[2] = impulse[2] - scale * brake.viscous * u
+        u = blend(brake.share, e[2], problem.start[2])
+        moment = moment - slip_scale((brake.knee * u) ** 2) * brake.viscous * u
+    return _miss(problem, e, (x, y, moment))
+
+
+def _miss(problem: SlidingProblem, e: Triple, impulse: Triple) -> Triple:
     slide, turn = problem.ease
-    return (
-        z[0] - slide * impulse[0],
-        z[1] - slide * impulse[1],
-        z[2] - turn * impulse[2],
-    )
+    x, y = out_of(problem.turn, e[0], e[1])
+    return x - slide * impulse[0], y - slide * impulse[1], e[2] - turn * impulse[2]
 
 
-def _jacobian(problem: SlidingProblem, z: Triple, one: FloatScalar):
-    """Derivative of the residual, rows of entries.
-
-    With A = F^T C u and B = S^T (knee² u), a slipping contact's part is
-    scale (F^T C S - scale² A B^T).
-    """
-    zero = jnp.zeros_like(problem.ease[1])
-    entries = [[zero] * 3 for _ in range(3)]
-    for drag in problem.drags:
-        force, speed, c = drag.force, drag.speed, drag.viscous
-        u, scale, is_slip = _slide(drag, z, one)
-        loss = jnp.where(is_slip, scale * scale * scale, 0.0)
-        k = tuple(g * g * v for g, v in zip(drag.knee, u, strict=True))
-        pull = [c[0] * u[0] * f + c[1] * u[1] * g for f, g in zip(*force, strict=True)]
-        pinch = [k[0] * f + k[1] * g for f, g in zip(*speed, strict=True)]
-        for i in range(3):
-            for j in range(3):
-                stick = (
-                    c[0] * force[0][i] * speed[0][j] + c[1] * force[1][i] * speed[1][j]
-                )
-                entries[i][j] = (
-                    entries[i][j] + scale * stick - loss * pull[i] * pinch[j]
-                )
-    for brake in problem.all_brakes:
-        _, _, is_slip = _turn(brake, z)
-        # Where it slips, in one dimension, the torque is constant.
-        entries[2][2] = entries[2][2] + jnp.where(
-            is_slip, 0.0, brake.viscous * brake.share
-        )
-    ease = (problem.ease[0], problem.ease[0], problem.ease[1])
-    return [
-        [hold(e * entries[i][j] + (1.0 if i == j else 0.0), one) for j in range(3)]
-        for i, e in enumerate(ease)
+def _jacobian(problem: SlidingProblem, entries, one: FloatScalar) -> list:
+    """R + L A, rows of entries."""
+    (cos, sin), (slide, turn) = problem.turn, problem.ease
+    xx, xy, xt, yx, yy, yt, tx, ty, tt = entries
+    rows = [
+        [cos + slide * xx, slide * xy - sin, slide * xt],
+        [slide * yx + sin, cos + slide * yy, slide * yt],
+        [turn * tx, turn * ty, 1.0 + turn * tt],
     ]
+    return [[hold(entry, one) for entry in row] for row in rows]
 
 
-def _newton(problem: SlidingProblem, one: FloatScalar) -> Triple:
+def _linearise(
+    problem: SlidingProblem, e: Triple, before: Triple | None, one: FloatScalar
+):
+    """Residual and its derivative, rows of entries."""
+    motions = Motions(e, problem.start, before)
+    parts = [track_sums(track, motions, one) for track in problem.tracks]
+    parts += [feet_sums(feet, motions, one) for feet in problem.feet]
+    # Where nothing but spin is resisted.
+    parts = parts or [(jnp.zeros_like(e[2]),) * 12]
+    *entries, x, y, moment = (
+        sum(column[1:], start=column[0]) for column in zip(*parts, strict=True)
+    )
+    for brake in problem.all_brakes:
+        u = blend(brake.share, e[2], problem.start[2])
+        ratio, is_back = brake.knee * u, False
+        if before is not None:
+            old = brake.knee * blend(brake.share, before[2], problem.start[2])
+            is_back = is_reversed((ratio,), (old,))
+        square = jnp.where(is_back, 1.0, ratio * ratio)
+        moment = moment + slip_scale(square) * brake.viscous * u
+        # Where it slips, in one dimension, the torque is constant.
+        slope = jnp.where(square > 1.0, 0.0, brake.viscous * brake.share)
+        entries[8] = entries[8] + slope
+    push = problem.push
+    impulse = (push[0] - x, push[1] - y, push[2] - moment)
+    return _miss(problem, e, impulse), _jacobian(problem, entries, one)
+
+
+def _newton(problem: SlidingProblem, stuck: Stuck, one: FloatScalar) -> Triple:
     """Several contacts: start from all of them sticking, then iterate."""
-    zero = jnp.zeros_like(problem.push[0] * one)
-    no_limit = problem._replace(
-        drags=[d._replace(knee=(zero, zero)) for d in problem.drags],
-        brakes=[b._replace(knee=zero) for b in problem.all_brakes],
-        joint=None,
-    )
-    start = (zero, zero, zero)
-    z = _newton_step(no_limit, start, one)
-    if not (problem.drags or problem.all_brakes):
-        return z
+    xx, xy, xt, yy, yt, tt = stuck.start
+    ux, uy, spin = problem.start
+    x = problem.push[0] - (xx * ux + xy * uy + xt * spin)
+    y = problem.push[1] - (xy * ux + yy * uy + yt * spin)
+    moment = problem.push[2] - (xt * ux + yt * uy + tt * spin)
+    slide, turn = problem.ease
+    pushed = tuple(hold(v, one) for v in (slide * x, slide * y, turn * moment))
+    xx, xy, xt, yy, yt, tt = stuck.end
+    jacobian = _jacobian(problem, (xx, xy, xt, xy, yy, yt, xt, yt, tt), one)
+    e = solve3(jacobian, pushed)
     return jax.lax.fori_loop(
-        0, _NUM_NEWTON, lambda _, z: _newton_step(problem, z, one), z
-    )
+        0, NUM_NEWTON, lambda _, pair: _newton_step(problem, *pair, one), (e, e)
+    )[0]
 
 
-def _newton_step(problem: SlidingProblem, z: Triple, one: FloatScalar) -> Triple:
-    miss = tuple(hold(r, one) for r in residual(problem, z, one))
-    change = solve3(_jacobian(problem, z, one), miss)
-    return tuple(hold(a - b, one) for a, b in zip(z, change, strict=True))
+def _newton_step(
+    problem: SlidingProblem, e: Triple, before: Triple, one: FloatScalar
+) -> tuple[Triple, Triple]:
+    miss, jacobian = _linearise(problem, e, before, one)
+    miss = tuple(hold(r, one) for r in miss)
+    change = solve3(jacobian, miss)
+    return tuple(a - b for a, b in zip(e, change, strict=True)), e
 
 
-def solve_sliding(problem: SlidingProblem, one: FloatScalar) -> Triple:
+def solve_sliding(
+    problem: SlidingProblem, stuck: Stuck | None, one: FloatScalar
+) -> Triple:
     """Velocity of the anchor and spin at the end of a step.
 
     Args:
         problem: momenta and frictions.
+        stuck: the same friction without limits; None for a single contact, or none.
         one: from `runtime_one`.
 
     Returns:
-        The anchor's velocity [m/s], in the frame at mid-step, and the spin [rad/s].
-        Differentiable by the implicit function theorem.
+        The anchor's velocity [m/s], in the body's frame at the end of the step, and the
+        spin [rad/s]. Differentiable by the implicit function theorem.
     """
 
     @jax.custom_jvp
-    def solve(problem, one):
-        if len(problem.drags) <= 1 and not problem.brakes:
-            drag = problem.drags[0] if problem.drags else None
-            return slipping_wheel(problem.push, problem.ease, drag, problem.joint, one)
-        return _newton(problem, one)
+    def solve(problem, stuck, one):
+        if stuck is None:
+            return slipping_wheel(problem, one)
+        return _newton(problem, stuck, one)
 
     def solve_jvp(primals, tangents):
-        (problem, one), (rate, _) = primals, tangents
-        z = solve(problem, one)
+        (problem, stuck, one), (rate, _, _) = primals, tangents
+        e = solve(problem, stuck, one)
         leaves, treedef = jax.tree.flatten(problem)
         rates = jax.tree.leaves(
             rate, is_leaf=lambda x: isinstance(x, jax.custom_derivatives.SymbolicZero)
@@ -209,17 +210,15 @@ def solve_sliding(problem: SlidingProblem, one: FloatScalar) -> Triple:
             full = list(leaves)
             for i, value in zip(moving, values, strict=True):
                 full[i] = value
-            return residual(jax.tree.unflatten(treedef, full), z, one)
+            return residual(jax.tree.unflatten(treedef, full), e)
 
         _, rate = jax.jvp(
             miss, ([leaves[i] for i in moving],), ([rates[i] for i in moving],)
         )
-        inverse = [
-            [hold(entry, one) for entry in row]
-            for row in inverse3(_jacobian(problem, z, one))
-        ]
+        _, jacobian = _linearise(problem, e, None, one)
+        inverse = [[hold(entry, one) for entry in row] for row in inverse3(jacobian)]
         rate = tuple(-hold(r, one) for r in rate)
-        return z, tuple(hold(v, one) for v in matvec3(inverse, rate))
+        return e, tuple(hold(v, one) for v in matvec3(inverse, rate))
 
     solve.defjvp(solve_jvp, symbolic_zeros=True)
-    return solve(problem, one)
+    return solve(problem, stuck, one)

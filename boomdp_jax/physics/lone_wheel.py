@@ -24,6 +24,7 @@ import jax.numpy as jnp
 
 from boomdp_jax.core.arrays import FloatScalar
 from boomdp_jax.core.holding import hold
+from boomdp_jax.physics.lone_contacts import track_speeds
 
 # Newton steps for s. Of 200,000 random wheels (viscous coefficients and limits over
 # four decades each, half of the bodies pinned) 99 % are then right to 5e-11 of the
@@ -33,34 +34,36 @@ _NUM_NEWTON = 4
 _TINY = 1e-30
 
 
-def slipping_wheel(push, ease, drag, brake, one: FloatScalar):
+def slipping_wheel(problem, one: FloatScalar):
     """Velocity of the anchor and spin at the end of a step.
 
     Args:
-        push: P, generalised momentum without friction, three numbers.
-        ease: l and g.
-        drag: the contact, or None.
-        brake: friction against spin, zero unless l is zero; or None.
+        problem: of `lone_friction`, with at most one contact and one brake (zero unless
+            the body is pinned).
         one: from `runtime_one`.
 
     Returns:
         Anchor velocity [m/s] and spin [rad/s].
     """
-    light, swing = ease
-    turning = push[2]
+    (light, swing), (cos, sin), brake = problem.ease, problem.turn, problem.joint
+    x, y, turning = problem.push
+    track = problem.tracks[0] if problem.tracks else None
     if brake is not None:
-        swing, turning = _held(turning, swing, drag, brake, one)
-    if drag is None:
-        return light * push[0], light * push[1], swing * turning
-    first, second = _forces((push[0], push[1], turning), (light, swing), drag, one)
-    impulse = [
-        p - f * first - g * second
-        for p, f, g in zip((push[0], push[1], turning), *drag.force, strict=True)
-    ]
-    return light * impulse[0], light * impulse[1], hold(swing * impulse[2], one)
+        swing, turning = _held(turning, swing, track, brake, problem.start, one)
+    if track is not None:
+        e = (light * (cos * x + sin * y), light * (cos * y - sin * x), swing * turning)
+        ease = (light, swing, cos, sin)
+        first, second = _forces(e, problem.start, ease, track, one)
+        x, y = x - first, y - second
+        turning = turning - track.reach[0] * first - track.lead * second
+    return (
+        light * (cos * x + sin * y),
+        light * (cos * y - sin * x),
+        hold(swing * turning, one),
+    )
 
 
-def _held(turning, swing, drag, brake, one):
+def _held(turning, swing, track, brake, start, one):
     """Take the brake into ease and push, in whichever of its three regimes it is."""
     is_limited = brake.knee > 0
     edge = 1.0 / jnp.where(is_limited, brake.knee, 1.0)
@@ -68,19 +71,16 @@ def _held(turning, swing, drag, brake, one):
 
     def balance(speed):
         """What is missing for the spin at which the brake sees this speed [N m s]."""
-        spin = (speed - brake.drift) / brake.share
+        spin = (speed - (1.0 - brake.share) * start[2]) / brake.share
         total = spin / swing - turning
-        if drag is None:
+        if track is None:
             return total
-        u = tuple(
-            row[2] * spin + drift
-            for row, drift in zip(drag.speed, drag.drift, strict=True)
-        )
-        square = (drag.knee[0] * u[0]) ** 2 + (drag.knee[1] * u[1]) ** 2
-        lever = (
-            drag.force[0][2] * drag.viscous[0] * u[0]
-            + drag.force[1][2] * drag.viscous[1] * u[1]
-        )
+        # Where the pin holds its anchor does not slide.
+        none = jnp.zeros_like(spin)
+        (u,), v = track_speeds(track, (none, none, spin), start)
+        (c, d), (k, m) = track.viscous, track.knee
+        square = (k * u) ** 2 + (m * v) ** 2
+        lever = track.reach[0] * c * u + track.lead * d * v
         return total + lever / jnp.sqrt(jnp.maximum(square, 1.0))
 
     is_ahead = is_limited & (balance(edge) + limit < 0)
@@ -88,32 +88,35 @@ def _held(turning, swing, drag, brake, one):
     way = jnp.where(is_ahead, 1.0, jnp.where(is_behind, -1.0, 0.0))
     way = hold(way, one)
     viscous = (1.0 - way * way) * brake.viscous
-    turning = hold(turning - way * limit - viscous * brake.drift, one)
+    turning = hold(
+        turning - way * limit - viscous * (1.0 - brake.share) * start[2], one
+    )
     return swing / (1.0 + swing * viscous * brake.share), turning
 
 
-def _forces(push, ease, drag, one):
+def _forces(e, start, ease, track, one):
     """Impulses of the contact along its two directions."""
-    light, swing = ease
-    c, knee = drag.viscous, drag.knee
-    b = []
-    for row, drift in zip(drag.speed, drag.drift, strict=True):
-        sliding = light * (row[0] * push[0] + row[1] * push[1])
-        b.append(hold(sliding + swing * row[2] * push[2] + drift, one))
+    light, swing, cos, sin = ease
+    c, knee, share = track.viscous, track.knee, track.share
+    p, q = track.reach[0], track.lead
+    (u,), v = track_speeds(track, e, start)
+    b = (hold(u, one), hold(v, one))
+    # H = Theta (l R^T + g a a^T) C, with a the arms.
+    twist, cross = light * sin, swing * p * q
     h = [
         [
-            c[j]
-            * (
-                light * _inner(drag.speed[i], drag.force[j])
-                + swing * drag.speed[i][2] * drag.force[j][2]
-            )
-            for j in range(2)
-        ]
-        for i in range(2)
+            share[0] * c[0] * (light * cos + swing * p * p),
+            share[0] * c[1] * (cross + twist),
+        ],
+        [
+            share[1] * c[0] * (cross - twist),
+            share[1] * c[1] * (light * cos + swing * q * q),
+        ],
     ]
     trace = h[0][0] + h[1][1]
     # Both rows lie in one line where l = 0; written so that nothing cancels there.
-    determinant = c[0] * c[1] * _determinant(drag, light, swing)
+    determinant = light * (light + swing * cos * (p * p + q * q))
+    determinant = determinant * (share[0] * c[0]) * (share[1] * c[1])
     turned = (h[1][1] * b[0] - h[0][1] * b[1], h[0][0] * b[1] - h[1][0] * b[0])
     # Everything is divided by the speed in units of the limits, so that nothing
     # overflows however small the limits are.
@@ -134,20 +137,6 @@ def _forces(push, ease, drag, one):
     return tuple(
         v * (s * x + y) / quadratic for v, x, y in zip(c, b, slow, strict=True)
     )
-
-
-def _inner(row, other):
-    return row[0] * other[0] + row[1] * other[1]
-
-
-def _determinant(drag, light, swing):
-    """Determinant of S L F^T by the Cauchy-Binet formula."""
-    (s0, s1, s2), (r0, r1, r2) = drag.speed
-    (f0, f1, f2), (g0, g1, g2) = drag.force
-    plane = (s0 * r1 - s1 * r0) * (f0 * g1 - f1 * g0)
-    sides = (s0 * r2 - s2 * r0) * (f0 * g2 - f2 * g0)
-    sides = sides + (s1 * r2 - s2 * r1) * (f1 * g2 - f2 * g1)
-    return light * (light * plane + swing * sides)
 
 
 def _slip(x, y, trace, determinant, least):

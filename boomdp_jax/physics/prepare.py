@@ -11,16 +11,24 @@ from boomdp_jax.core.holding import hold, runtime_one
 from boomdp_jax.physics.friction import (
     Contact,
     Spin,
-    fit_weights,
     friction_points,
-    implicit_weight,
     joint_spin,
+    wheel_headings,
+)
+from boomdp_jax.physics.implicit_fit import (
+    contact_groups,
+    fit_weights,
+    implicit_weight,
 )
 from boomdp_jax.physics.joints import Slot, joint_slots, select
 from boomdp_jax.physics.lone_body import LoneBody, lone_body
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.small_linear import dot3, matvec3
+
+MOST_LONE_CONTACTS = 16
+"""Contacts of a lone body that are written out one by one: above, the general solver,
+which stacks them, compiles faster."""
 
 
 class Prepared(NamedTuple):
@@ -72,15 +80,37 @@ def prepare(scene: Scene, params: Params, length: FloatScalar) -> Prepared | Lon
             else jax.tree.map(lambda *parts: jnp.concatenate(parts), spins, joints)
         )
     inverse = _mobility(pins, mass, inertia)
-    contacts, spins = fit_weights(
-        contacts, spins, inverse, mass, inertia, mobile, length
+    one = runtime_one(mass)
+
+    def held(values):
+        # Else the compiler works all of this out again for whatever reads it.
+        return jax.tree.map(
+            lambda leaf: hold(leaf, jnp.broadcast_to(one, leaf.shape)), values
+        )
+
+    groups = contact_groups(scene, params)
+    contacts, spins, inverse = held((contacts, spins, inverse))
+    contacts, spins = held(
+        fit_weights(groups, contacts, spins, inverse, mass, inertia, mobile, length)
     )
     weight = (length * mass * scene.gravity[0], length * mass * scene.gravity[1])
-    num_contacts = 0 if contacts is None else contacts.rolling[0].shape[0]
-    num_spins = 0 if spins is None else spins.viscous.shape[0]
-    is_simple = num_contacts <= 1 and num_spins == len(pins)
-    if scene.num_bodies == 1 and len(pins) <= 1 and not rods and is_simple:
-        return lone_body(length, mobile, mass, inertia, weight, contacts, spins, pins)
+    is_lone = scene.num_bodies == 1 and len(pins) <= 1 and not rods
+    if is_lone and groups.num_contacts <= MOST_LONE_CONTACTS:
+        facing = jnp.zeros_like(mass)
+        if groups.num_wheels:
+            facing = wheel_headings(params.wheel)[0, 0]
+        return lone_body(
+            length,
+            mobile,
+            mass,
+            inertia,
+            weight,
+            contacts,
+            groups,
+            facing,
+            spins,
+            pins,
+        )
     prepared = Prepared(
         length=length,
         mobile=mobile,
@@ -92,10 +122,9 @@ def prepare(scene: Scene, params: Params, length: FloatScalar) -> Prepared | Lon
         slots=pins + rods,
         joint_spins=joint_spins,
     )
-    # Else the compiler works all of this out again for every state and every step.
-    one = runtime_one(mass)
     return jax.tree.map(
         lambda leaf: (
+            # Likewise, for every state and every step.
             leaf
             if leaf is length or not jnp.issubdtype(leaf.dtype, jnp.floating)
             else hold(leaf, jnp.reshape(one, (-1,))[0])

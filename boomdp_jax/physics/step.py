@@ -29,7 +29,8 @@ from boomdp_jax.physics.joints import (
     Frames,
     joint_rows,
 )
-from boomdp_jax.physics.lone_body import LoneBody, lone_error, lone_substep
+from boomdp_jax.physics.lone_body import LoneBody
+from boomdp_jax.physics.lone_step import lone_error, lone_substep
 from boomdp_jax.physics.motion import Motion, motion_of, scalars, state_of
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.prepare import Prepared, prepare
@@ -38,9 +39,6 @@ from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
 from boomdp_jax.physics.trigonometry import sincos
 from boomdp_jax.physics.velocity_solve import VelocityProblem, solve_velocity
-
-# Newton steps per velocity update; see `solve_velocity`.
-_NUM_NEWTON = 3
 
 
 class StepInfo(eqx.Module):
@@ -179,8 +177,7 @@ def _substep(prepared: Prepared | LoneBody, motion: Motion, force) -> Motion:
             rows_end=rows_end,
             compliance=compliance,
             joint_spins=prepared.joint_spins,
-        ),
-        _NUM_NEWTON,
+        )
     )
     wx, wy, new_spin = held(solution.twist)
     new_vx, new_vy = cos * wx - sin * wy, sin * wx + cos * wy
@@ -203,8 +200,7 @@ def _info(prepared: Prepared | LoneBody, motion: Motion) -> StepInfo:
     """Joint drift and finiteness of a motion."""
     square = jnp.zeros((), motion.x.dtype)
     if isinstance(prepared, LoneBody):
-        if prepared.pivot is not None:
-            square = lone_error(prepared.pivot, motion)
+        square = lone_error(prepared, motion)
     elif prepared.slots:
         sin, cos = sincos(motion.theta)
         frames = Frames(motion.x, motion.y, cos, sin)

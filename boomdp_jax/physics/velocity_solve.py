@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.holding import hold, runtime_one
-from boomdp_jax.physics.friction import Contact, Spin, limited
+from boomdp_jax.physics.friction import NUM_NEWTON, Contact, Spin, limited
 from boomdp_jax.physics.joints import Row, Slot, select
 from boomdp_jax.physics.small_linear import dot3, inverse3, matvec3, solve_rows
 
@@ -116,7 +116,9 @@ def _joint_speed(slot: Slot, spin: Spin, w: Twist, start: Twist):
     return _blend(spin.weight, relative(w[2]), relative(start[2]))
 
 
-def _residual(problem: VelocityProblem, solution: Solution):
+def _residual(
+    problem: VelocityProblem, solution: Solution, before: Twist | None = None
+):
     """How far from solved: per body three numbers, then one per row."""
     w, start = solution.twist, problem.start
     out = [
@@ -127,7 +129,8 @@ def _residual(problem: VelocityProblem, solution: Solution):
     contact, spin = problem.contacts, problem.spins
     if contact is not None:
         u = _contact_speed(problem, w)
-        scale, _ = limited(u, contact.viscous, contact.knee)
+        old = None if before is None else _contact_speed(problem, before)
+        scale, _ = limited(u, contact.viscous, contact.knee, old)
         rolling = scale * contact.viscous[0] * u[0]
         lateral = scale * contact.viscous[1] * u[1]
         out = [
@@ -136,7 +139,8 @@ def _residual(problem: VelocityProblem, solution: Solution):
         ]
     if spin is not None:
         u = _spin_speed(spin, w, start)
-        scale, _ = limited((u,), (spin.viscous,), (spin.knee,))
+        old = None if before is None else (_spin_speed(spin, before, start),)
+        scale, _ = limited((u,), (spin.viscous,), (spin.knee,), old)
         out[2] = out[2] + jnp.sum(scale * spin.viscous * u, axis=0)
     num = len(problem.rows_mid)
     for row, impulse in zip(problem.rows_mid, solution.impulse[:num], strict=True):
@@ -153,25 +157,29 @@ def _residual(problem: VelocityProblem, solution: Solution):
         weight_a: Any = slot.a
         out[2] = out[2] - impulse * slot.active * (weight_a - slot.b)
         u = _joint_speed(slot, joint, w, start)
-        scale, _ = limited((u,), (joint.viscous,), (joint.knee,))
+        old = None if before is None else (_joint_speed(slot, joint, before, start),)
+        scale, _ = limited((u,), (joint.viscous,), (joint.knee,), old)
         tail.append(scale * joint.viscous * u + impulse)
     return tuple(out), tail
 
 
-def _slopes(problem: VelocityProblem, w: Twist):
+def _slopes(problem: VelocityProblem, w: Twist, before: Twist | None = None):
     """K of every friction at a twist."""
     start, contact, spin = problem.start, problem.contacts, problem.spins
     k_contact = k_spin = None
     if contact is not None:
         u = _contact_speed(problem, w)
-        _, k_contact = limited(u, contact.viscous, contact.knee)
+        old = None if before is None else _contact_speed(problem, before)
+        _, k_contact = limited(u, contact.viscous, contact.knee, old)
     if spin is not None:
         u = _spin_speed(spin, w, start)
-        _, ((k_spin,),) = limited((u,), (spin.viscous,), (spin.knee,))
+        old = None if before is None else (_spin_speed(spin, before, start),)
+        _, ((k_spin,),) = limited((u,), (spin.viscous,), (spin.knee,), old)
     k_joints = []
     for slot, joint in problem.joint_spins:
         u = _joint_speed(slot, joint, w, start)
-        _, ((k,),) = limited((u,), (joint.viscous,), (joint.knee,))
+        old = None if before is None else (_joint_speed(slot, joint, before, start),)
+        _, ((k,),) = limited((u,), (joint.viscous,), (joint.knee,), old)
         k_joints.append(k)
     return k_contact, k_spin, k_joints
 
@@ -246,19 +254,23 @@ def _solve_linear(
     return Solution(tuple(twist), impulse)
 
 
-def _newton(problem: VelocityProblem, num_iterations: int) -> Solution:
+def _newton(problem: VelocityProblem) -> Solution:
     """Start from sticking contacts, then iterate."""
     num = len(problem.rows_mid) + len(problem.joint_spins)
     zero = jnp.zeros_like(problem.mass)
     rest = Solution((zero, zero, zero), [jnp.zeros((), zero.dtype)] * num)
     # Sticking is the viscous law without limits, whose solution is one linear solve.
     sticking = _unlimited(problem)
-    solution = _newton_step(sticking, rest)
+    solution = _newton_step(sticking, rest, None)
     if problem.contacts is None and problem.spins is None and not problem.joint_spins:
         return solution
-    return jax.lax.fori_loop(
-        0, num_iterations, lambda _, s: _newton_step(problem, s), solution
-    )
+
+    def advance(_, pair):
+        solution, before = pair
+        return _newton_step(problem, solution, before), solution.twist
+
+    first = (solution, solution.twist)
+    return jax.lax.fori_loop(0, NUM_NEWTON, advance, first)[0]
 
 
 def _unlimited(problem: VelocityProblem) -> VelocityProblem:
@@ -274,24 +286,24 @@ def _unlimited(problem: VelocityProblem) -> VelocityProblem:
     )
 
 
-def _newton_step(problem: VelocityProblem, solution: Solution) -> Solution:
-    out, tail = _residual(problem, solution)
+def _newton_step(
+    problem: VelocityProblem, solution: Solution, before: Twist | None
+) -> Solution:
+    out, tail = _residual(problem, solution, before)
     step = _solve_linear(
         problem,
-        _slopes(problem, solution.twist),
+        _slopes(problem, solution.twist, before),
         tuple(-o for o in out),
         [-t for t in tail],
     )
     return jax.tree.map(jnp.add, solution, step)
 
 
-def solve_velocity(problem: VelocityProblem, num_iterations: int) -> Solution:
+def solve_velocity(problem: VelocityProblem) -> Solution:
     """Solve one velocity update.
 
     Args:
         problem: momenta, frictions and joint rows.
-        num_iterations: Newton steps after the sticking solution. Three bring one wheel
-            or four feet to rounding; more only cost.
 
     Returns:
         Twists and impulses. Differentiable by the implicit function theorem.
@@ -299,7 +311,7 @@ def solve_velocity(problem: VelocityProblem, num_iterations: int) -> Solution:
 
     @jax.custom_jvp
     def solve(problem):
-        return _newton(problem, num_iterations)
+        return _newton(problem)
 
     def solve_jvp(primals, tangents):
         (problem,), (rate,) = primals, tangents

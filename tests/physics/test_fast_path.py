@@ -1,0 +1,247 @@
+"""The solver for a lone body against the general one, which shares no equations."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import boomdp_jax.physics.prepare as preparation
+import boomdp_jax.physics.velocity_solve as general
+from boomdp_jax.physics import Params, State, step
+from boomdp_jax.physics.params import Distance, Ground, Revolute, Wheel
+from tests.physics.scenes import make_scene
+from tests.reference.planar_dynamics import World
+
+SCENE = make_scene(World([(0.3, 0.1)], [20.0]))
+ONE_FOOT = type(SCENE)(
+    **{
+        **vars(SCENE),
+        "feet": SCENE.feet[:, :1],
+        "foot_load": jnp.ones((1, 1)),
+        "num_substeps": 1,
+    }
+)
+"""The same on a single foot and in one substep, which compiles faster."""
+NUM_CASES = 512
+
+
+def draw(key, spread: float, has_nuisances: bool):
+    """A hypothesis with random masks and numbers, a state that obeys it, a wrench.
+
+    Coefficients and limits are lognormal with the given standard deviation; four means
+    four decades each way: ground of 1e8 N s/m, limits of a milligram's weight.
+    """
+    keys = iter(jax.random.split(key, 24))
+
+    def normal(*shape):
+        return jax.random.normal(next(keys), shape)
+
+    def uniform(low, high, *shape):
+        return jax.random.uniform(next(keys), shape, minval=low, maxval=high)
+
+    has_pin, has_wheel, has_ground = jax.random.bernoulli(next(keys), shape=(3,))
+    theta, spin, slide, position = uniform(-3.0, 3.0), normal(), normal(2), normal(2)
+    anchor = uniform(-0.3, 0.3, 2)
+    cos, sin = jnp.cos(theta), jnp.sin(theta)
+    arm = jnp.stack(
+        [cos * anchor[0] - sin * anchor[1], sin * anchor[0] + cos * anchor[1]]
+    )
+    pinned = spin * jnp.stack([arm[1], -arm[0]])
+    no_number = jnp.zeros(0)
+    params = Params(
+        density=20.0 * jnp.exp(0.5 * normal(1)),
+        revolute=Revolute(
+            active=has_pin[None],
+            body_a=jnp.zeros(1, jnp.int32),
+            body_b=jnp.full(1, -1, jnp.int32),
+            anchor_a=anchor[None],
+            anchor_b=(position + arm)[None],
+            viscous=0.1 * jnp.exp(spread * normal(1)),
+            dry=0.5 * jnp.exp(spread * normal(1)),
+        ),
+        distance=Distance(
+            active=jnp.zeros(0, bool),
+            body_a=jnp.zeros(0, jnp.int32),
+            body_b=jnp.zeros(0, jnp.int32),
+            anchor_a=jnp.zeros((0, 2)),
+            anchor_b=jnp.zeros((0, 2)),
+            length=no_number,
+        ),
+        wheel=Wheel(
+            active=has_wheel[None, None],
+            position=uniform(-0.3, 0.3, 1, 1, 2),
+            heading=uniform(-3.0, 3.0, 1, 1),
+            viscous=jnp.array([[[5.0, 60.0]]]) * jnp.exp(spread * normal(1, 1, 2)),
+            dry=jnp.array([[[1.0, 8.0]]]) * jnp.exp(spread * normal(1, 1, 2)),
+            half_track=uniform(0.0, 0.2, 1, 1) if has_nuisances else None,
+        ),
+        ground=Ground(
+            active=has_ground[None, None],
+            dry=0.3 * jnp.exp(0.7 * spread * normal(1, 1)),
+            viscous=300.0 * jnp.exp(2.0 * spread * normal(1, 1)),
+            torque_share=uniform(0.0, 1.0, 1, 1) if has_nuisances else None,
+            load_shift=0.05 * normal(1, 1, 2) if has_nuisances else None,
+        ),
+    )
+    twist = jnp.append(jnp.where(has_pin, pinned, slide), spin)
+    state = State(jnp.append(position, theta)[None], twist[None])
+    wrench = normal(1, 3) * jnp.array([[5.0, 5.0, 1.0]])
+    return params, state, wrench
+
+
+def draws(spread: float = 1.0, *, has_nuisances: bool = True, seed: int = 0):
+    """Many of them."""
+    keys = jax.random.split(jax.random.key(seed), NUM_CASES)
+    return jax.jit(jax.vmap(lambda key: draw(key, spread, has_nuisances)))(keys)
+
+
+def run_step(params, state, wrench, scene=SCENE):
+    """One step of one hypothesis."""
+    return step(scene, params, state, wrench)[0].array
+
+
+# Compiled once for each set of slots, whatever they hold.
+fast_step = jax.jit(jax.vmap(run_step))
+
+
+@jax.jit
+@jax.vmap
+def general_step(params, state, wrench):
+    """The same on the general path."""
+    return run_step(params, state, wrench)
+
+
+def on_general_path(function, *arguments):
+    """Call a compiled function whose first call, its trace, avoids the fast path."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(preparation, "MOST_LONE_CONTACTS", -1)
+        return function(*arguments)
+
+
+def worst_of_each(array, expected):
+    """Largest difference of each hypothesis."""
+    array, expected = np.asarray(array), np.asarray(expected)
+    difference = np.abs(array - expected).reshape(len(array), -1)
+    assert np.all(np.isfinite(difference))
+    return np.max(difference, axis=1)
+
+
+@pytest.mark.parametrize("has_nuisances", [True, False], ids=["full", "plain"])
+def test_fast_path_agrees_with_the_general_one(has_nuisances):
+    for spread in (1.0, 4.0):
+        cases = draws(spread, has_nuisances=has_nuisances)
+        difference = worst_of_each(
+            fast_step(*cases), on_general_path(general_step, *cases)
+        )
+        # The general path keeps redundant rows solvable by a softness of 4e-10.
+        assert np.max(difference) < 1e-6
+        assert np.quantile(difference, 0.99) < 1e-8
+
+
+def test_fast_path_agrees_with_itself_in_single_precision():
+    double = np.asarray(fast_step(*draws()))
+    single = jax.tree.map(
+        lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf,
+        (SCENE, draws()),
+    )
+    with jax.enable_x64(False):
+        scene, cases = single
+        result = jax.jit(jax.vmap(lambda p, s, w: step(scene, p, s, w)[0].array))(
+            *cases
+        )
+    assert result.dtype == jnp.float32
+    # Stiff contacts are held to a stiffness of 1e-4 / eps there, which shows as a creep
+    # of one part in a thousand of what would have been the velocity.
+    difference = worst_of_each(np.asarray(result), double)
+    assert np.quantile(difference, 0.9) < 1e-4
+    assert np.quantile(difference, 0.99) < 1e-2
+
+
+def test_friction_is_solved_to_the_end():
+    cases = draws(seed=1)
+    usual = np.asarray(fast_step(*cases))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(preparation, "MOST_LONE_CONTACTS", -1)
+        patch.setattr(general, "NUM_NEWTON", 40)
+        solved = np.asarray(jax.jit(jax.vmap(lambda *c: run_step(*c)))(*cases))
+    difference = worst_of_each(usual, solved)
+    # One hypothesis in a thousand may need more iterations than there are: with 512
+    # cases, four or more of those have a probability of two in a thousand.
+    assert np.sum(difference > 1e-7) < 4, np.sort(difference)[-8:]
+
+
+def test_masks_that_are_off_leave_a_free_body():
+    params, state, wrench = draws()
+    off = jax.tree.map(
+        lambda leaf: jnp.zeros_like(leaf) if leaf.dtype == bool else leaf, params
+    )
+    end = np.asarray(fast_step(off, state, wrench))[:, 0]
+    mass = np.asarray(off.density[:, 0] * SCENE.area[0])
+    inertia = mass * float(SCENE.gyration[0])
+    push = np.asarray(wrench[:, 0]) / np.stack([mass, mass, inertia], axis=1)
+    dt, twist = float(SCENE.dt), np.asarray(state.twist[:, 0])
+    np.testing.assert_allclose(end[:, 3:], twist + dt * push, rtol=1e-12, atol=1e-12)
+    moved = np.asarray(state.pose[:, 0]) + dt * twist + 0.5 * dt**2 * push
+    np.testing.assert_allclose(end[:, :3], moved, rtol=1e-12, atol=1e-12)
+
+
+def split(params):
+    """Numbers of a hypothesis, and what puts them back."""
+    leaves, treedef = jax.tree.flatten(params)
+    is_number = [jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves]
+    numbers = [leaf for n, leaf in zip(is_number, leaves, strict=True) if n]
+
+    def join(numbers):
+        moving = iter(numbers)
+        full = [
+            next(moving) if n else leaf
+            for n, leaf in zip(is_number, leaves, strict=True)
+        ]
+        return jax.tree.unflatten(treedef, full)
+
+    return numbers, join
+
+
+def inputs_and_direction(params, state, wrench, key):
+    """A step as a function of all its numbers, those, and a random direction."""
+    numbers, join = split(params)
+    inputs = (numbers, state, wrench)
+    leaves, treedef = jax.tree.flatten(inputs)
+    keys = jax.random.split(key, len(leaves))
+    # Relative changes of a hypothesis, so that no number drowns the others.
+    along = [
+        (leaf if i < len(numbers) else jnp.ones_like(leaf))
+        * jax.random.normal(k, leaf.shape)
+        for i, (k, leaf) in enumerate(zip(keys, leaves, strict=True))
+    ]
+
+    def run(numbers, state, wrench):
+        return run_step(join(numbers), state, wrench, ONE_FOOT)
+
+    return run, inputs, jax.tree.unflatten(treedef, along)
+
+
+def forward(params, state, wrench, key):
+    """Derivative along a random direction."""
+    return jax.jvp(*inputs_and_direction(params, state, wrench, key))[1]
+
+
+def backward(params, state, wrench, key):
+    """Inner product of that derivative with the ramp 1, 2, ..., by reverse mode."""
+    run, inputs, direction = inputs_and_direction(params, state, wrench, key)
+    end, pull = jax.vjp(run, *inputs)
+    pulled = pull(jnp.arange(1.0, 1.0 + end.size).reshape(end.shape))
+    pairs = zip(jax.tree.leaves(pulled), jax.tree.leaves(direction), strict=True)
+    return sum(jnp.sum(a * b) for a, b in pairs)
+
+
+def test_derivatives_agree_between_modes_and_paths():
+    cases = *draws(seed=2), jax.random.split(jax.random.key(3), NUM_CASES)
+    rate = np.asarray(jax.jit(jax.vmap(forward))(*cases)).reshape(NUM_CASES, -1)
+    total = np.asarray(jax.jit(jax.vmap(backward))(*cases))
+    scale = np.max(np.abs(rate), axis=1)
+    along_ramp = rate @ np.arange(1.0, 1.0 + rate.shape[1])
+    np.testing.assert_allclose((along_ramp - total) / scale, 0.0, atol=1e-9)
+    slow = on_general_path(jax.jit(jax.vmap(lambda *c: forward(*c))), *cases)
+    difference = worst_of_each(rate, np.reshape(slow, rate.shape)) / scale
+    assert np.quantile(difference, 0.99) < 1e-6
