@@ -7,6 +7,10 @@ with the priors of `prior.py` (Scholz et al. (2014), A Physics-Based Model Prior
 Object-Oriented MDPs, section 4). Every handler of NumPyro works on it: `Predictive`,
 `SVI`, `NUTS`, `condition`, `substitute`. To infer which constraints exist, use
 `structure_kernel` or `infer`.
+
+For a run of your own, `NUTS(model, dense_mass=True, regularize_mass_matrix=False)`:
+NumPyro's regularised mass matrix is a hundred times too wide for anchors. `run_nuts`
+also starts from fitted modes, which pins and wheels need.
 """
 
 from typing import Any
