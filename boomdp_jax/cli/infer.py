@@ -66,7 +66,8 @@ def _infer(arguments: argparse.Namespace, spec, histories: list) -> list:
         from boomdp_jax.inference.infer import infer, infer_batch
 
         key = jax.random.key(arguments.seed)
-        options = {"method": arguments.method, "progress": True}
+        method = arguments.method
         if len(histories) == 1:
-            return [infer(key, spec, histories[0], **options)]
-        return list(infer_batch(key, [spec] * len(histories), histories, **options))
+            return [infer(key, spec, histories[0], method=method, progress=True)]
+        specs = [spec] * len(histories)
+        return list(infer_batch(key, specs, histories, method=method, progress=True))

@@ -1,9 +1,13 @@
 """From a history to a posterior over Φ and over which constraints exist."""
 
+from boomdp_jax.inference.fitted_kernel import structure_kernel as structure_kernel
 from boomdp_jax.inference.infer import METHODS as METHODS
 from boomdp_jax.inference.infer import infer as infer
 from boomdp_jax.inference.infer import infer_batch as infer_batch
 from boomdp_jax.inference.laplace_mixture import LaplaceMixture as LaplaceMixture
+from boomdp_jax.inference.numpyro_model import ObjectModel as ObjectModel
+from boomdp_jax.inference.numpyro_model import make_model as make_model
+from boomdp_jax.inference.nuts import run_nuts as run_nuts
 from boomdp_jax.inference.posterior import Posterior as Posterior
 from boomdp_jax.inference.posterior import load_posterior as load_posterior
 from boomdp_jax.inference.predict import predict as predict
@@ -13,11 +17,15 @@ from boomdp_jax.inference.target import StructureTarget as StructureTarget
 __all__ = [
     "METHODS",
     "LaplaceMixture",
+    "ObjectModel",
     "Posterior",
     "StructureKernel",
     "StructureTarget",
     "infer",
     "infer_batch",
     "load_posterior",
+    "make_model",
     "predict",
+    "run_nuts",
+    "structure_kernel",
 ]

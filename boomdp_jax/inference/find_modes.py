@@ -63,11 +63,7 @@ def find_modes(
     rng = host_generator(key)
     guesses = Guesses.of(targets)
     report("fitting single steps")
-    fits = climb(
-        targets, first_fits(rng, targets, guesses, settings), settings.num_iterations
-    )
-    grown = grown_fits(rng, targets, guesses, fits, settings)
-    fits = join_fits(fits, climb(targets, grown, settings.num_iterations))
+    fits = _single_step_fits(rng, targets, guesses, settings)
     likelihood: Any = targets.log_likelihood
     scale = np.asarray(likelihood.coordinates.scales.noise, float)
     num_bodies = likelihood.reference.shape[1]
@@ -85,6 +81,37 @@ def find_modes(
         grown = grown_fits(rng, targets, guesses, fits, settings)
         fits = join_fits(fits, climb(targets, grown, limit))
     return Found(targets, collect_modes(targets, fits, settings.num_modes), noise)
+
+
+def find_single_step_modes(
+    key: Key, targets: StructureTarget, settings: FitSettings
+) -> Modes:
+    """Fit every structure by its one-step likelihood alone, as equation 1 has it.
+
+    Args:
+        key: source of starts.
+        targets: as for `find_modes`.
+        settings: how hard to look.
+
+    Returns:
+        Up to `num_modes` modes per structure and object.
+    """
+    rng = host_generator(key)
+    fits = _single_step_fits(rng, targets, Guesses.of(targets), settings)
+    return collect_modes(targets, fits, settings.num_modes)
+
+
+def _single_step_fits(
+    rng: np.random.Generator,
+    targets: StructureTarget,
+    guesses: Guesses,
+    settings: FitSettings,
+) -> Fits:
+    """Fits from anywhere, and from fits of smaller structures."""
+    starts = first_fits(rng, targets, guesses, settings)
+    fits = climb(targets, starts, settings.num_iterations)
+    grown = grown_fits(rng, targets, guesses, fits, settings)
+    return join_fits(fits, climb(targets, grown, settings.num_iterations))
 
 
 def _champions(targets: StructureTarget, top: Fits) -> Fits:

@@ -12,11 +12,13 @@ from boomdp_jax.inference.assemble import BlockResult, assemble_posterior
 from boomdp_jax.inference.block import Block, make_block, stack_blocks
 from boomdp_jax.inference.compile_ahead import signature
 from boomdp_jax.inference.components import independent_blocks
+from boomdp_jax.inference.fixed_structure import Structure
+from boomdp_jax.inference.nuts import run_nuts
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.sample import SampleSettings, sample_blocks
 from boomdp_jax.physics.scene_spec import SceneSpec
 
-METHODS = ("auto", "rj")
+METHODS = ("auto", "rj", "nuts")
 """Ways to infer: `auto` is `rj` until something better exists."""
 
 
@@ -26,6 +28,7 @@ def infer(
     history: History,
     *,
     method: str = "auto",
+    structure: Structure | None = None,
     num_chains: int = 4,
     num_warmup: int = 200,
     num_samples: int = 500,
@@ -37,7 +40,10 @@ def infer(
         key: random key.
         spec: the scene: outlines, what is known, what may exist.
         history: recorded transitions. An empty one gives the prior.
-        method: `rj`, reversible jump over structures, or `auto`.
+        method: `rj`, reversible jump over structures; `nuts`, a given structure by
+            the one-step likelihood, see `run_nuts`; or `auto`.
+        structure: for `nuts`: constraints that exist besides the known ones, such as
+            `{"table": ["revolute"]}`; default: the most probable ones.
         num_chains: chains, run side by side.
         num_warmup: iterations of each that adapt and are thrown away.
         num_samples: iterations of each that are kept.
@@ -55,6 +61,7 @@ def infer(
         [spec],
         [history],
         method=method,
+        structure=structure,
         num_chains=num_chains,
         num_warmup=num_warmup,
         num_samples=num_samples,
@@ -68,6 +75,7 @@ def infer_batch(
     histories: Sequence[History],
     *,
     method: str = "auto",
+    structure: Structure | None = None,
     num_chains: int = 4,
     num_warmup: int = 200,
     num_samples: int = 500,
@@ -80,6 +88,7 @@ def infer_batch(
         specs: the scenes.
         histories: one for each scene.
         method: as in `infer`.
+        structure: as in `infer`, the same for all scenes.
         num_chains: as in `infer`.
         num_warmup: as in `infer`.
         num_samples: as in `infer`.
@@ -101,6 +110,22 @@ def infer_batch(
         )
     for spec, history in zip(specs, histories, strict=True):
         _check(spec, history)
+    if method == "nuts":
+        return [
+            run_nuts(
+                jax.random.fold_in(key, index),
+                spec,
+                history,
+                structure=structure,
+                num_warmup=num_warmup,
+                num_samples=num_samples,
+                num_chains=num_chains,
+                progress_bar=progress,
+            )
+            for index, (spec, history) in enumerate(zip(specs, histories, strict=True))
+        ]
+    if structure is not None:
+        raise ValueError(f"structure: expected none with method {method!r}")
     settings = SampleSettings(num_chains, num_warmup, num_samples)
     start = time.perf_counter()
     problems, notes = [], []

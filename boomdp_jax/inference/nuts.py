@@ -44,6 +44,10 @@ def run_nuts(
 ) -> Posterior:
     """Posterior over the numbers of one structure, noise scales included.
 
+    The likelihood is that of equations 1 to 3 of the paper: single steps, from readings
+    that are taken as exact. Where what a step starts from is as noisy as what it ends
+    at, `infer` with method `rj`, which treats states as latent, is the better judge.
+
     Args:
         key: random key.
         spec: the scene: outlines, what is known, what may exist.
@@ -126,7 +130,8 @@ def _most_probable(
     doubts = []
     for number, bodies in enumerate(blocks):
         block = make_block(spec, bodies, history)
-        _, evidence = fitted_mixture(jax.random.fold_in(key, number), block.target)
+        fitted = fitted_mixture(jax.random.fold_in(key, number), block.target)
+        evidence = fitted.evidence
         best = int(jnp.argmax(evidence.probability))
         probability = float(evidence.probability[best])
         active = np.asarray(block.target.structures[best])

@@ -31,11 +31,16 @@ from numpyro.infer.util import potential_energy
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.inference.block import stack_blocks
 from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics
-from boomdp_jax.inference.fit import fit_modes
+from boomdp_jax.inference.find_modes import find_single_step_modes
+from boomdp_jax.inference.fit import FitSettings
 from boomdp_jax.inference.mixture_building import laplace_mixture
 from boomdp_jax.inference.model_sites import Site
 from boomdp_jax.inference.numpyro_model import ObjectModel
-from boomdp_jax.inference.one_step import NOISE_SHAPE, draw_noise
+from boomdp_jax.inference.one_step import (
+    NOISE_SHAPE,
+    OneStepLikelihood,
+    draw_noise,
+)
 from boomdp_jax.inference.prior import NOISE_GROUPS
 
 # Iterations of one compiled call; what is left over at the end is thrown away.
@@ -200,7 +205,7 @@ def _fitted_start(
     """Draws from the fitted modes' mixture, and the heaviest mode's covariance."""
     (block,) = model.blocks
     targets = stack_blocks([block])
-    modes = fit_modes(fit_key, targets)
+    modes = find_single_step_modes(fit_key, targets, FitSettings())
     modes = jax.tree.map(lambda leaf: leaf[0], modes)
     return _start_at(start_key, model, modes, num_chains)
 
@@ -208,7 +213,8 @@ def _fitted_start(
 @eqx.filter_jit
 def _start_at(key: Key, model: ObjectModel, modes: Any, num_chains: int) -> _Start:
     target = model.blocks[0].target
-    likelihood: Any = target.log_likelihood
+    tracked: Any = target.log_likelihood
+    likelihood = OneStepLikelihood(tracked.coordinates, tracked.data.steps)
     mixture = laplace_mixture(
         target, modes.structure, modes.z, modes.precision, modes.log_density
     )

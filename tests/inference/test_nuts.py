@@ -12,6 +12,7 @@ from boomdp_jax.inference.fixed_structure import structure_blocks
 from boomdp_jax.inference.numpyro_model import make_model, model_of_blocks
 from boomdp_jax.inference.nuts import run_nuts
 from boomdp_jax.inference.nuts_chains import sample_model
+from boomdp_jax.inference.one_step import OneStepLikelihood
 from tests.inference.test_numpyro_model import make_spec, pushed
 
 
@@ -41,9 +42,9 @@ def test_mass_of_a_free_box_agrees_with_quadrature():
         assert np.mean(drawn < truth) == pytest.approx(p, abs=slack)
     # Given coordinates and noise prior, the noise has a closed form: check its mean.
     mode = float(z[np.argmax(weight), 0])
-    statistics = block.target.log_likelihood.statistics(
-        jnp.asarray([mode]), jnp.zeros(0, bool)
-    )
+    tracked = block.target.log_likelihood
+    plain = OneStepLikelihood(tracked.coordinates, tracked.data.steps)
+    statistics = plain.statistics(jnp.asarray([mode]), jnp.zeros(0, bool))
     shape = 1.0 + 0.5 * np.asarray(statistics.num[0])
     rate = np.array([1e-3, 1e-3, 4e-3, 4e-3]) ** 2 + 0.5 * np.asarray(
         statistics.square[0]
