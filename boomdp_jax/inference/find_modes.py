@@ -76,10 +76,13 @@ def find_modes(
         targets = with_gains(targets, top, noise)
         again = make_fits(targets, fits.index, fits.structure, fits.z)
         again = best_of_each(again, num_structures, settings.num_starts)
-        limit = settings.num_repeats if number else settings.num_iterations
-        fits = climb(targets, again, limit)
+        if number > 0:
+            # Gains have changed a little, and what there is to find has been found.
+            fits = climb(targets, again, settings.num_repeats)
+            continue
+        fits = climb(targets, again, settings.num_iterations)
         grown = grown_fits(rng, targets, guesses, fits, settings)
-        fits = join_fits(fits, climb(targets, grown, limit))
+        fits = join_fits(fits, climb(targets, grown, settings.num_iterations))
     return Found(targets, collect_modes(targets, fits, settings.num_modes), noise)
 
 

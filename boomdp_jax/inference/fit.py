@@ -25,7 +25,7 @@ _DAMPING_FACTORS = np.array([0.1, 1.0, 10.0])
 # A fit whose log-density gains less than this in an iteration has arrived.
 _ARRIVED = 1e-3
 # After so many iterations a fit this far below the best of its structure is given up.
-_PATIENCE, _HOPELESS = 4, 30.0
+_PATIENCE, _HOPELESS = 3, 25.0
 # Steps of the differences in posterior standard deviations, and their limits in prior
 # ones by float size: above the rounding of the prediction, below its curvature.
 _DIFFERENCE = 0.2
@@ -39,9 +39,9 @@ class FitSettings(NamedTuple):
     """Starts whose density is looked at."""
     num_starts: int = 4
     """Best of them that are fitted."""
-    num_iterations: int = 10
+    num_iterations: int = 8
     """Most iterations of a climb with single steps, then again with filters."""
-    num_repeats: int = 6
+    num_repeats: int = 5
     """Most iterations of a later climb, from fits with other gains."""
     num_modes: int = 3
     """Distinct modes that are kept."""

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar
 from boomdp_jax.inference.track_data import TrackData
-from boomdp_jax.inference.tracking import Gains, channel_difference, predict_state
+from boomdp_jax.inference.tracking import Gains, channel_difference, predictor
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 
@@ -70,6 +70,7 @@ def extended_filter(
         Gains, and the log-density of all readings but the first of each track.
     """
     steps = data.steps
+    predict = predictor(scene, params, steps.dt)
     num_bodies = steps.state.shape[1]
     num = 6 * num_bodies
     scale = channel_scale(noise.reading).reshape(-1)
@@ -109,7 +110,6 @@ def extended_filter(
     def advance(carry, row):
         state, covariance, total = carry
         is_start, is_second, start, first, first_mask, action, last, last_mask, dt = row
-        dt = steps.dt if dt is None else dt
         first_covariance = jnp.diag(
             jnp.where(first_mask.reshape(-1) > 0, scale, unknown) ** 2
         )
@@ -120,7 +120,7 @@ def extended_filter(
         )
         total = total + density
         points = jnp.concatenate([state[None], state[None] + offsets])
-        images = jax.vmap(lambda x: predict_state(scene, params, x, action, dt))(points)
+        images = jax.vmap(lambda x: predict(x, action, dt))(points)
         state = images[0]
         slope = (images[1:] - images[:1]).reshape(num, num).T / scale[None]
         spread = covariance + jnp.diag(kick**2)

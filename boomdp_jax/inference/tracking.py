@@ -13,6 +13,8 @@ least squares. With K = 1 for the reading that a step starts from and K = 0 for 
 that it ends at, this is the one-step likelihood of "What Does Physics Bias".
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -23,7 +25,7 @@ from boomdp_jax.inference.track_data import TrackData
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import state_from_array
-from boomdp_jax.physics.step import step
+from boomdp_jax.physics.step import prepare_step, step
 
 # Largest number of channels for which products with gains are written out; beyond it
 # a library call costs less than the compilation of so many terms.
@@ -90,15 +92,34 @@ def channel_difference(
     return difference.at[:, 2].set(angle - 2.0 * jnp.pi * turns)
 
 
-def predict_state(
-    scene: Scene,
-    params: Params,
-    state: Float[Array, "body 6"],
-    action: Float[Array, "body 3"],
-    dt: FloatScalar,
-) -> Float[Array, "body 6"]:
-    """One step from channels to channels."""
-    return step(scene, params, state_from_array(state), action, dt=dt)[0].array
+Predict = Callable[
+    [Float[Array, "body 6"], Float[Array, "body 3"], FloatScalar | None],
+    Float[Array, "body 6"],
+]
+"""From channels, wrenches and a length (None: that of all steps) to channels."""
+
+
+def predictor(
+    scene: Scene, params: Params, dt: Float[Array, " time"] | Float[Array, ""]
+) -> Predict:
+    """One step from channels to channels.
+
+    Args:
+        scene: the block's scene.
+        params: one hypothesis.
+        dt: length of all steps, or of each; if of all, what depends on it and on the
+            hypothesis alone is worked out once.
+    """
+    if dt.ndim == 0:
+        prepared = prepare_step(scene, params, dt=dt)
+        return lambda state, action, _: (
+            prepared(state_from_array(state), action)[0].array
+        )
+
+    def predict(state, action, length):
+        return step(scene, params, state_from_array(state), action, dt=length)[0].array
+
+    return predict
 
 
 def innovations(
@@ -118,6 +139,7 @@ def innovations(
     """
     steps = data.steps
     shape = steps.state.shape[1:]
+    predict = predictor(scene, params, steps.dt)
 
     def correct(state, reading, mask, gain, whitening):
         error = mask * channel_difference(reading, state)
@@ -130,13 +152,12 @@ def innovations(
         state, first_error = correct(
             state, first, first_mask, gain.first, gain.first_whitening
         )
-        state = predict_state(scene, params, state, action, dt)
+        state = predict(state, action, dt)
         state, last_error = correct(
             state, last, last_mask, gain.last, gain.last_whitening
         )
         return state, jnp.stack([first_error, last_error])
 
-    num_rows = steps.state.shape[0]
     rows = (
         data.is_start,
         data.start,
@@ -145,15 +166,9 @@ def innovations(
         steps.action,
         steps.next_state,
         data.last_mask,
-        jnp.broadcast_to(steps.dt, (num_rows,)) if steps.dt.ndim else None,
+        steps.dt if steps.dt.ndim else None,
         gains,
     )
-    if steps.dt.ndim == 0:
-        # One length for all rows stays out of the loop, and what depends on it too.
-        def advance_uniform(state, row):
-            return advance(state, (*row[:7], steps.dt, row[8]))
-
-        return jax.lax.scan(advance_uniform, jnp.zeros(shape), rows)[1]
     return jax.lax.scan(advance, jnp.zeros(shape), rows)[1]
 
 

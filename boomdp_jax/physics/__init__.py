@@ -15,6 +15,7 @@ from boomdp_jax.physics.scene_spec import scene_spec_from_dict as scene_spec_fro
 from boomdp_jax.physics.state import State as State
 from boomdp_jax.physics.state import state_from_array as state_from_array
 from boomdp_jax.physics.step import StepInfo as StepInfo
+from boomdp_jax.physics.step import prepare_step as prepare_step
 from boomdp_jax.physics.step import rollout as rollout
 from boomdp_jax.physics.step import step as step
 
@@ -31,6 +32,7 @@ __all__ = [
     "Wheel",
     "empty_params",
     "load_scene",
+    "prepare_step",
     "rollout",
     "save_scene",
     "scene_spec_from_dict",

@@ -17,6 +17,7 @@ instant at which a contact starts or ceases to slip (a kink), and tell only of s
 where everything sticks: there the motion does not depend on the dry limits at all.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -79,6 +80,33 @@ def step(
     prepared = prepare(scene, params, length)
     motion = _step(scene, prepared, motion_of(state), wrench)
     return state_of(motion, scene.num_bodies), _info(prepared, motion)
+
+
+def prepare_step(
+    scene: Scene, params: Params, *, dt: Float[Array, ""] | float | None = None
+) -> Callable[[State, Float[Array, "body 3"]], tuple[State, StepInfo]]:
+    """Work out all that does not depend on the state, for many steps from it.
+
+    Inside a loop of one's own (a filter, a controller) a step then costs what one of
+    `rollout` costs.
+
+    Args:
+        scene: outlines, feet, gravity.
+        params: one hypothesis.
+        dt: length of the step [s]; default: the scene's.
+
+    Returns:
+        A function from state and wrench `[body, 3]` to the next state and what there
+        is to report; the same as `step`.
+    """
+    length = jnp.asarray(scene.dt if dt is None else dt, scene.area.dtype)
+    prepared = prepare(scene, params, length)
+
+    def advance(state: State, wrench: Float[Array, "body 3"]) -> tuple[State, StepInfo]:
+        motion = _step(scene, prepared, motion_of(state), wrench)
+        return state_of(motion, scene.num_bodies), _info(prepared, motion)
+
+    return advance
 
 
 def rollout(
