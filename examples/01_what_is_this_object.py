@@ -7,7 +7,7 @@ of them for two seconds and writes down noisy positions and speeds (1 mm, 1 mrad
 and which way? How heavy is it? And what will it do next?
 
 Expect each object's true structure to get nearly all of the probability, its pin to a
-few millimetres, its axle line to a centimetre, its mass to a few per cent. A wheel slid
+millimetre, its axle line to a few, its mass to one per cent. A wheel slid
 along its own axle looks the same: its place along the axle stays open, and says so.
 
 Needs MuJoCo and matplotlib (`pip install 'boomdp_jax[test]'`). Takes about a minute on

@@ -9,8 +9,11 @@ The bob is a disc half a metre from the motor; its motion is computed from the a
 torque at the joint is a torque at the centre of mass, as the pin takes up the rest. We
 learn from the first run, predict the second, and compare with what its makers weighed:
 0.676 kg in all at 0.50 m, and dry friction of 0.20 to 0.26 N m (fits to whole runs).
-Expect the mass within some 10 % of that, and the joint's dry friction not far off; with
-that friction left out of the law the same data would make the bob half as heavy again.
+Expect the pin to be certain and in its place, the motion half a second ahead to be
+predicted ten times better than by constant velocity, and a mass that is half too high:
+the torque in this record comes some 30 ms after the motion that it causes, the filter
+puts that down to impulses from nowhere, and these hide the friction. A wide interval
+for the friction says that it was not seen.
 
     python examples/02_real_pendulum.py PATH/TO/FOLDER_WITH_THE_TWO_FILES
 """
