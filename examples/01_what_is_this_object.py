@@ -101,9 +101,7 @@ for (left, middle, right), family, truth, posterior, history in rows:
     draw_posterior(left, posterior, truth=truth.params())
     draw_structure_bars(middle, posterior)
     draw_prediction(right, posterior, history, num_steps=EPISODE)
-    left.set_title(
-        f"{family}: outline, pin and wheel ({left.get_title()})", fontsize=10
-    )
+    left.set_title(f"{family} ({left.get_title()})", fontsize=10)
     middle.set_title(f"{family}: which structure?", fontsize=10)
     right.set_title(f"{family}: predicted against held-out motion", fontsize=10)
 path = arguments.out / "what_is_this_object.png"
