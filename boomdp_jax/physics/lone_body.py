@@ -42,8 +42,10 @@ class Pivot(NamedTuple):
     """r: anchor in the body's (turned) frame [m]."""
     world: Pair
     """Where it is to be [m]."""
-    mobile: FloatScalar
-    """One if it is active and its body can move."""
+    place: Pair
+    """The same; zero if inactive."""
+    free: FloatScalar
+    """One if it is inactive, else zero."""
     levelling: FloatScalar
     """Turn that puts right an anchor off by one metre at a lever of one [rad/m²]."""
 
@@ -114,20 +116,22 @@ def lone_body(
     anchor = turned_anchor = (zero, zero)
     if pins:
         (pin,) = pins
-        anchor = (pin.active * pin.anchor_a[0], pin.active * pin.anchor_a[1])
+        on = pin.active * mobile
+        anchor = (on * pin.anchor_a[0], on * pin.anchor_a[1])
         turned_anchor = into(axis, *anchor)
         square = anchor[0] ** 2 + anchor[1] ** 2
-        levelling = pin.active * mobile * mass / (mass * square + inertia)
+        levelling = on * mass / (mass * square + inertia)
         pivot = held(
             Pivot(
-                pin.active,
-                turned_anchor,
-                pin.anchor_b,
-                pin.active * mobile,
-                levelling,
+                active=pin.active,
+                anchor=turned_anchor,
+                world=pin.anchor_b,
+                place=(on * pin.anchor_b[0], on * pin.anchor_b[1]),
+                free=1.0 - on,
+                levelling=levelling,
             )
         )
-        ease = (1.0 - pin.active) * ease
+        ease = (1.0 - on) * ease
     parts = [] if contacts is None else _parts(contacts)
     num_wheels = groups.num_wheels * groups.num_sides
     tracks = [

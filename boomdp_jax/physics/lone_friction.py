@@ -9,10 +9,11 @@ $$R\,e = L\,(P - F^T f(\bar u)), \qquad \bar u = F(\Theta e + (1 - \Theta) e_0),
 
 with f the one friction law (`friction`), F its directions in the body's frame, R the
 turn from the end of the step back to mid-step, where impulses act, and $\Theta$ the
-share of the end velocity. One wheel is solved by one scalar equation (`lone_wheel`).
-Several contacts are solved by Newton's method from the solution in which all stick,
-which is linear with coefficients that do not change (`Stuck`). Derivatives come from
-the implicit function theorem: one 3 x 3 system, in both modes.
+share of the end velocity; R e is what is returned. One wheel is solved by one scalar
+equation (`lone_wheel`). Several contacts are solved by Newton's method from the
+solution in which all stick, which is linear with coefficients that do not change
+(`Stuck`). Derivatives come from the implicit function theorem: one 3 x 3 system, in
+both modes.
 """
 
 from typing import NamedTuple
@@ -32,6 +33,7 @@ from boomdp_jax.physics.lone_contacts import (
     blend,
     feet_force,
     feet_sums,
+    into,
     out_of,
     slip_scale,
     track_force,
@@ -70,7 +72,7 @@ class SlidingProblem(NamedTuple):
     start: Triple
     """Velocity of the anchor and spin at the start, in the body's frame there."""
     ease: Pair
-    """l and g: velocity of the anchor and spin per generalised impulse."""
+    """l and 1/g: velocity of the anchor per impulse [1/kg], inertia [kg m²]."""
     turn: Pair
     """Cosine and sine of the turn from mid-step to the end."""
     tracks: list[Track]
@@ -86,8 +88,9 @@ class SlidingProblem(NamedTuple):
         return self.brakes + ([] if self.joint is None else [self.joint])
 
 
-def residual(problem: SlidingProblem, e: Triple) -> Triple:
-    """R e - L (P - F^T f): zero at the solution."""
+def residual(problem: SlidingProblem, solution: Triple) -> Triple:
+    """R e - L (P - F^T f), of R e as it is returned: zero at the solution."""
+    e = (*into(problem.turn, *solution[:2]), solution[2])
     motions = Motions(e, problem.start)
     forces = [track_force(track, motions) for track in problem.tracks]
     forces += [feet_force(feet, motions) for feet in problem.feet]
@@ -97,18 +100,18 @@ def residual(problem: SlidingProblem, e: Triple) -> Triple:
     for brake in problem.all_brakes:
         u = blend(brake.share, e[2], problem.start[2])
         moment = moment - slip_scale((brake.knee * u) ** 2) * brake.viscous * u
-    return _miss(problem, e, (x, y, moment))
+    return _miss(problem, solution, (x, y, moment))
 
 
-def _miss(problem: SlidingProblem, e: Triple, impulse: Triple) -> Triple:
-    slide, turn = problem.ease
-    x, y = out_of(problem.turn, e[0], e[1])
-    return x - slide * impulse[0], y - slide * impulse[1], e[2] - turn * impulse[2]
+def _miss(problem: SlidingProblem, solution: Triple, impulse: Triple) -> Triple:
+    slide, turn = problem.ease[0], 1.0 / problem.ease[1]
+    x, y, spin = solution
+    return x - slide * impulse[0], y - slide * impulse[1], spin - turn * impulse[2]
 
 
 def _jacobian(problem: SlidingProblem, entries, one: FloatScalar) -> list:
     """R + L A, rows of entries."""
-    (cos, sin), (slide, turn) = problem.turn, problem.ease
+    (cos, sin), slide, turn = problem.turn, problem.ease[0], 1.0 / problem.ease[1]
     xx, xy, xt, yx, yy, yt, tx, ty, tt = entries
     rows = [
         [cos + slide * xx, slide * xy - sin, slide * xt],
@@ -143,7 +146,8 @@ def _linearise(
         entries[8] = entries[8] + slope
     push = problem.push
     impulse = (push[0] - x, push[1] - y, push[2] - moment)
-    return _miss(problem, e, impulse), _jacobian(problem, entries, one)
+    solution = (*out_of(problem.turn, e[0], e[1]), e[2])
+    return _miss(problem, solution, impulse), _jacobian(problem, entries, one)
 
 
 def _newton(problem: SlidingProblem, stuck: Stuck, one: FloatScalar) -> Triple:
@@ -153,7 +157,7 @@ def _newton(problem: SlidingProblem, stuck: Stuck, one: FloatScalar) -> Triple:
     x = problem.push[0] - (xx * ux + xy * uy + xt * spin)
     y = problem.push[1] - (xy * ux + yy * uy + yt * spin)
     moment = problem.push[2] - (xt * ux + yt * uy + tt * spin)
-    slide, turn = problem.ease
+    slide, turn = problem.ease[0], 1.0 / problem.ease[1]
     pushed = tuple(hold(v, one) for v in (slide * x, slide * y, turn * moment))
     xx, xy, xt, yy, yt, tt = stuck.end
     jacobian = _jacobian(problem, (xx, xy, xt, xy, yy, yt, xt, yt, tt), one)
@@ -183,19 +187,20 @@ def solve_sliding(
         one: from `runtime_one`.
 
     Returns:
-        The anchor's velocity [m/s], in the body's frame at the end of the step, and the
-        spin [rad/s]. Differentiable by the implicit function theorem.
+        The anchor's velocity [m/s], in the frame at mid-step, and the spin [rad/s].
+        Differentiable by the implicit function theorem.
     """
 
     @jax.custom_jvp
     def solve(problem, stuck, one):
         if stuck is None:
             return slipping_wheel(problem, one)
-        return _newton(problem, stuck, one)
+        x, y, spin = _newton(problem, stuck, one)
+        return *out_of(problem.turn, x, y), spin
 
     def solve_jvp(primals, tangents):
         (problem, stuck, one), (rate, _, _) = primals, tangents
-        e = solve(problem, stuck, one)
+        solution = solve(problem, stuck, one)
         leaves, treedef = jax.tree.flatten(problem)
         rates = jax.tree.leaves(
             rate, is_leaf=lambda x: isinstance(x, jax.custom_derivatives.SymbolicZero)
@@ -210,15 +215,17 @@ def solve_sliding(
             full = list(leaves)
             for i, value in zip(moving, values, strict=True):
                 full[i] = value
-            return residual(jax.tree.unflatten(treedef, full), e)
+            return residual(jax.tree.unflatten(treedef, full), solution)
 
         _, rate = jax.jvp(
             miss, ([leaves[i] for i in moving],), ([rates[i] for i in moving],)
         )
+        e = (*into(problem.turn, *solution[:2]), solution[2])
         _, jacobian = _linearise(problem, e, None, one)
         inverse = [[hold(entry, one) for entry in row] for row in inverse3(jacobian)]
         rate = tuple(-hold(r, one) for r in rate)
-        return e, tuple(hold(v, one) for v in matvec3(inverse, rate))
+        x, y, spin = (hold(v, one) for v in matvec3(inverse, rate))
+        return solution, (*out_of(problem.turn, x, y), spin)
 
     solve.defjvp(solve_jvp, symbolic_zeros=True)
     return solve(problem, stuck, one)

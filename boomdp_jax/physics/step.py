@@ -31,7 +31,7 @@ from boomdp_jax.physics.joints import (
     joint_rows,
 )
 from boomdp_jax.physics.lone_body import LoneBody
-from boomdp_jax.physics.lone_step import lone_error, lone_substep
+from boomdp_jax.physics.lone_step import lone_error, lone_step
 from boomdp_jax.physics.motion import Motion, motion_of, scalars, state_of
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.prepare import Prepared, prepare
@@ -139,7 +139,11 @@ def rollout(
         return motion, (motion, _info(prepared, motion))
 
     inputs = (wrenches, length if constant is None else None)
-    _, (motions, infos) = jax.lax.scan(advance, motion_of(state), inputs)
+    # A reverse pass takes every step again from the state before it: cheaper than to
+    # store the hundred numbers of each substep, and long rollouts fit into memory.
+    _, (motions, infos) = jax.lax.scan(
+        jax.checkpoint(advance, prevent_cse=False), motion_of(state), inputs
+    )
     return state_of(motions, scene.num_bodies), infos
 
 
@@ -148,6 +152,8 @@ def _step(
 ) -> Motion:
     """All substeps of one step."""
     force = scalars(wrench)
+    if isinstance(prepared, LoneBody):
+        return lone_step(prepared, motion, force, scene.num_substeps)
     if scene.num_substeps == 1:
         return _substep(prepared, motion, force)
     motion, _ = jax.lax.scan(
@@ -159,9 +165,7 @@ def _step(
     return motion
 
 
-def _substep(prepared: Prepared | LoneBody, motion: Motion, force) -> Motion:
-    if isinstance(prepared, LoneBody):
-        return lone_substep(prepared, motion, force)
+def _substep(prepared: Prepared, motion: Motion, force) -> Motion:
     h, mobile = prepared.length, prepared.mobile
     mass, inertia = prepared.mass, prepared.inertia
     vx, vy, spin = (mobile * v for v in motion[3:])

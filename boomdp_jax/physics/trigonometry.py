@@ -61,3 +61,64 @@ def _sincos_jvp(primals, tangents):
     (angle,), (rate,) = primals, tangents
     sin, cos = sincos(angle)
     return (sin, cos), (cos * rate, -sin * rate)
+
+
+def heading_turn(
+    angle: Float[Array, "*shape"],
+) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
+    """Cosine and sine of any angle [rad], at half the cost of `sincos`.
+
+    In float32 a rational approximation as in `rotation` after whole revolutions are
+    taken away: absolute error under 3e-7 for |angle| < 1e4. In float64 the library's.
+
+    Args:
+        angle: any angle [rad].
+
+    Returns:
+        cos(angle) and sin(angle).
+    """
+    if angle.dtype != jnp.float32:
+        return jnp.cos(angle), jnp.sin(angle)
+    turns = jax.lax.stop_gradient(jnp.round(angle * np.float32(0.5 / np.pi)))
+    rest = angle
+    for part in _HALF_PI:
+        rest = rest - turns * (4 * part)
+    half = 0.5 * rest
+    square = half * half
+    n = half * (135135.0 + square * (-17325.0 + square * (378.0 - square)))
+    d = 135135.0 + square * (-62370.0 + square * (3150.0 - 28.0 * square))
+    return _from_tangent(n, d)
+
+
+def rotated(
+    start: tuple[Float[Array, "*shape"], Float[Array, "*shape"]] | None,
+    angle: Float[Array, "*shape"],
+) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
+    """Cosine and sine of an angle after turning a little further.
+
+    From a rational approximation of the tangent of half the angle (Padé, 5 over 4):
+    always a rotation, wrong by less than 2e-7 rad up to two rad and by 3e-5 at half a
+    revolution; beyond, a step means nothing. A fifth of the arithmetic of `sincos`,
+    and no branches.
+
+    Args:
+        start: cosine and sine before; None: of zero.
+        angle: turned through [rad].
+
+    Returns:
+        Cosine and sine.
+    """
+    half = 0.5 * angle
+    square = half * half
+    n = half * (945.0 + square * (square - 105.0))
+    d = 945.0 + square * (15.0 * square - 420.0)
+    return _from_tangent(n, d, start)
+
+
+def _from_tangent(n, d, start=None):
+    """Cosine and sine of an angle from its half's tangent n / d."""
+    cos, sin, total = d * d - n * n, 2.0 * d * n, d * d + n * n
+    if start is not None:
+        cos, sin = start[0] * cos - start[1] * sin, start[1] * cos + start[0] * sin
+    # Both divided, not multiplied by one inverse: see `core.holding`.
+    return cos / total, sin / total
