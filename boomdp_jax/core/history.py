@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from boomdp_jax.core.arrays import IntScalar
+from boomdp_jax.core.arrays import IntScalar, on_device
 
 
 class Transition(eqx.Module):
@@ -138,15 +138,15 @@ def make_history(
         return np.pad(array, width, constant_values=fill)
 
     return History(
-        state=jnp.asarray(pad(np.nan_to_num(state)), float),
-        action=jnp.asarray(pad(action), float),
-        next_state=jnp.asarray(pad(np.nan_to_num(next_state)), float),
-        dt=jnp.asarray(pad(dt, dt[0] if num_rows else 1.0), float),
-        episode=jnp.asarray(pad(episode.astype(np.int32), -1)),
-        mask=jnp.asarray(pad(np.ones(num_rows, bool))),
-        state_mask=jnp.asarray(pad(~np.isnan(state))),
-        next_state_mask=jnp.asarray(pad(~np.isnan(next_state))),
-        is_chained=jnp.asarray(pad(is_chained)),
+        state=on_device(pad(np.nan_to_num(state))),
+        action=on_device(pad(action)),
+        next_state=on_device(pad(np.nan_to_num(next_state))),
+        dt=on_device(pad(dt, dt[0] if num_rows else 1.0)),
+        episode=on_device(pad(episode, -1), np.dtype(np.int32)),
+        mask=on_device(pad(np.ones(num_rows, bool)), bool),
+        state_mask=on_device(pad(~np.isnan(state)), bool),
+        next_state_mask=on_device(pad(~np.isnan(next_state)), bool),
+        is_chained=on_device(pad(is_chained), bool),
     )
 
 

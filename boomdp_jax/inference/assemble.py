@@ -2,12 +2,11 @@
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from boomdp_jax.core.arrays import Key
+from boomdp_jax.core.arrays import Key, on_device
+from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.one_step import NOISE_SHAPE
@@ -32,7 +31,7 @@ class BlockResult(NamedTuple):
 _DRAWS_PER_CALL = 1024
 
 
-@eqx.filter_jit
+@QuickCompile
 def _decode_some(coordinates, z, active):
     return jax.vmap(coordinates)(z, active)
 
@@ -44,7 +43,7 @@ def _decode(coordinates, z: np.ndarray, active: np.ndarray) -> Params:
     for begin in range(0, num, _DRAWS_PER_CALL):
         rows = np.minimum(np.arange(begin, begin + _DRAWS_PER_CALL), num - 1)
         part = _decode_some(
-            coordinates, jnp.asarray(z[rows]), jnp.asarray(active[rows])
+            coordinates, on_device(z[rows], z.dtype), on_device(active[rows], bool)
         )
         parts.append(jax.tree.map(np.asarray, part))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:num], *parts)
@@ -93,18 +92,18 @@ def assemble_posterior(
     params, inferred = _merge(spec, blocks, posterior_parts)
     prior_params, _ = _merge(spec, blocks, prior_parts)
     num_draws = params.density.shape[0]
+    chain = results[0].draws.chain_index if results else np.arange(num_chains)
     return Posterior(
         params=params,
         noise_scale=_merge_noise(spec, blocks, noise_parts, num_draws),
-        log_weight=jnp.full(num_draws, -np.log(num_draws)),
-        log_density=sum(
-            (r.draws.log_density[r.place] for r in results), start=jnp.zeros(num_draws)
+        log_weight=on_device(np.full(num_draws, -np.log(num_draws))),
+        log_density=on_device(
+            sum(
+                (np.asarray(r.draws.log_density[r.place]) for r in results),
+                start=np.zeros(num_draws),
+            )
         ),
-        chain=jnp.repeat(jnp.arange(num_chains), num_draws // num_chains)
-        if not results
-        else jnp.asarray(results[0].draws.chain_index).repeat(
-            num_draws // len(results[0].draws.chain_index)
-        ),
+        chain=on_device(chain.repeat(num_draws // len(chain)), int),
         prior_params=prior_params,
         prior_noise_scale=_merge_noise(
             spec, blocks, prior_noise_parts, prior_params.density.shape[0]
@@ -189,15 +188,16 @@ def _merge(
 
     def build(kind: str) -> Any:
         kwargs = {
-            name: jnp.asarray(
-                value, dtype if np.issubdtype(value.dtype, np.floating) else None
+            name: on_device(
+                value,
+                dtype if np.issubdtype(value.dtype, np.floating) else value.dtype,
             )
             for name, value in fields[kind].items()
         }
         return type(getattr(whole, kind))(**kwargs)
 
     params = Params(
-        density=jnp.asarray(density, dtype),
+        density=on_device(density, dtype),
         revolute=build("revolute"),
         distance=build("distance"),
         wheel=build("wheel"),
@@ -210,7 +210,7 @@ def _merge_noise(spec: SceneSpec, blocks: list[Block], parts: list, num_draws: i
     out = np.ones((num_draws, spec.num_bodies, 4))
     for block, part in zip(blocks, parts, strict=True):
         out[:, np.asarray(block.bodies)] = np.asarray(part)
-    return jnp.asarray(out, float)
+    return on_device(out)
 
 
 def _diagnostics(

@@ -3,9 +3,9 @@
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from boomdp_jax.core.arrays import on_device
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.coordinates import Coordinates, surroundings
 from boomdp_jax.inference.filtered_likelihood import FilteredLikelihood
@@ -60,23 +60,26 @@ def make_block(spec: SceneSpec, bodies: tuple[int, ...], history: History) -> Bl
     )
     dt = np.asarray(history.dt)[np.asarray(history.mask)]
     data = track_data(history, bodies, bool(dt.size == 0 or np.all(dt == dt[0])))
-    reference = jnp.tile(coordinates.scales.noise[None], (len(bodies), 1))
+    scale = np.asarray(coordinates.scales.noise)
+    reference = np.tile(scale[None], (len(bodies), 1))
     gains = one_step_gains(data, channel_scale(reference))
     target = StructureTarget(
         log_likelihood=FilteredLikelihood(
             coordinates=coordinates,
             data=data,
-            structures=jnp.asarray(rows),
+            structures=on_device(rows, bool),
             gains=jax.tree.map(
-                lambda leaf: jnp.broadcast_to(leaf[None], (len(rows), *leaf.shape)),
+                lambda leaf: on_device(
+                    np.broadcast_to(np.asarray(leaf), (len(rows), *leaf.shape))
+                ),
                 gains,
             ),
-            reference=reference,
+            reference=on_device(reference),
         ),
-        structures=jnp.asarray(rows),
-        log_prior=jnp.asarray(log_prior, float),
-        slot=jnp.asarray(layout.slot_of_coordinate(), jnp.int32),
-        period=jnp.asarray(layout.period(), float),
+        structures=on_device(rows, bool),
+        log_prior=on_device(log_prior),
+        slot=on_device(layout.slot_of_coordinate(), np.dtype(np.int32)),
+        period=on_device(layout.period()),
     )
     return Block(bodies, layout, target)
 
@@ -100,15 +103,16 @@ def _positions(history: History, bodies: tuple[int, ...]) -> np.ndarray:
 
 def _block_scene(scene: Scene, bodies: tuple[int, ...]) -> Scene:
     """The scene of a block's bodies; outlines shrink to a point, nothing collides."""
-    index = jnp.asarray(bodies)
+    index = np.asarray(bodies)
 
     def pick(array):
-        return array[index]
+        picked = np.asarray(array)[index]
+        return on_device(picked, picked.dtype)
 
     return Scene(
-        vertices=jnp.zeros((len(bodies), 1, 2)),
-        vertex_mask=jnp.zeros((len(bodies), 1), bool),
-        radius=jnp.zeros(len(bodies)),
+        vertices=on_device(np.zeros((len(bodies), 1, 2))),
+        vertex_mask=on_device(np.zeros((len(bodies), 1)), bool),
+        radius=on_device(np.zeros(len(bodies))),
         area=pick(scene.area),
         gyration=pick(scene.gyration),
         feet=pick(scene.feet),
@@ -123,4 +127,7 @@ def _block_scene(scene: Scene, bodies: tuple[int, ...]) -> Scene:
 
 def stack_blocks(blocks: list[Block]) -> StructureTarget:
     """Targets of equal layout with a leading axis, for one compiled call."""
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(b.target for b in blocks))
+    return jax.tree.map(
+        lambda *leaves: jax.device_put(np.stack([np.asarray(x) for x in leaves])),
+        *(b.target for b in blocks),
+    )

@@ -8,7 +8,6 @@ coordinates within the most probable structure.
 
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpyro.diagnostics import effective_sample_size, split_gelman_rubin
@@ -113,7 +112,9 @@ def _within_structure(
     ]
     kept, period = np.stack(rows), np.asarray(target.period)
     series = {}
-    for index in np.flatnonzero(np.asarray(target.in_use(jnp.asarray(commonest)))):
+    slot, active = np.asarray(target.slot), np.asarray(target.structures)[commonest]
+    is_used = np.append(active, True)[slot]
+    for index in np.flatnonzero(is_used):
         value = kept[..., index]
         if period[index] > 0:
             turn = 2.0 * np.pi * value / period[index]

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from boomdp_jax.core.arrays import on_device
 from boomdp_jax.inference.layout import Layout, SlotKey
 from boomdp_jax.inference.prior import PriorScales
 from boomdp_jax.physics.params import (
@@ -84,23 +85,22 @@ def surroundings(
     lows, highs = np.stack(lows), np.stack(highs)
     known = {
         slot.known: {
-            key: jnp.asarray(number, float)
+            key: on_device(number)
             for key, number in spec.constraints[slot.known].numbers.items()
         }
         for slot in layout.known_slots
     }
     return Surroundings(
-        radius=jnp.asarray(radii, float),
-        half_extents=jnp.asarray((highs - lows) / 2, float),
-        box_center=jnp.asarray((highs + lows) / 2, float),
-        center=jnp.asarray(np.stack(centers), float),
-        spread=jnp.asarray(spreads, float),
-        density=jnp.asarray(
+        radius=on_device(radii),
+        half_extents=on_device((highs - lows) / 2),
+        box_center=on_device((highs + lows) / 2),
+        center=on_device(np.stack(centers)),
+        spread=on_device(spreads),
+        density=on_device(
             [
                 np.nan if spec.bodies[i].density is None else spec.bodies[i].density
                 for i in bodies
-            ],
-            float,
+            ]
         ),
         known=known,
     )

@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from boomdp_jax.core.arrays import on_device
+from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.tracking import Gains
 
@@ -42,7 +43,7 @@ class _Chunks(NamedTuple):
     active: Bool[Array, "chunk slot"]
 
 
-@eqx.filter_jit
+@QuickCompile
 def _gather(targets: StructureTarget, index, structure) -> _Chunks:
     likelihood: Any = targets.log_likelihood
     gains = jax.tree.map(lambda leaf: leaf[index, structure], likelihood.gains)
@@ -51,7 +52,7 @@ def _gather(targets: StructureTarget, index, structure) -> _Chunks:
     return _Chunks(bare, gains, targets.structures[index, structure])
 
 
-@eqx.filter_jit
+@QuickCompile
 def _evaluate_chunks(chunks: _Chunks, z):
     """Log-likelihoods of chunks `[chunk, point, dim]`."""
 
@@ -132,10 +133,10 @@ def evaluate_points(
         rows = slice(number * _CHUNKS_PER_CALL, (number + 1) * _CHUNKS_PER_CALL)
         chunks = _gather(
             targets,
-            jnp.asarray(owner[rows] // num_structures, jnp.int32),
-            jnp.asarray(owner[rows] % num_structures, jnp.int32),
+            on_device(owner[rows] // num_structures, np.dtype(np.int32)),
+            on_device(owner[rows] % num_structures, np.dtype(np.int32)),
         )
-        calls.append(_evaluate_chunks(chunks, jnp.asarray(z[source[rows]], dtype)))
+        calls.append(_evaluate_chunks(chunks, on_device(z[source[rows]], dtype)))
     flat = source[:total].reshape(-1)
 
     def gather(pick):

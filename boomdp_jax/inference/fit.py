@@ -12,10 +12,10 @@ in use), and small linear systems are solved by NumPy.
 
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from boomdp_jax.core.arrays import on_device
 from boomdp_jax.inference.evaluate import evaluate_points
 from boomdp_jax.inference.one_step import NOISE_SHAPE
 from boomdp_jax.inference.target import StructureTarget
@@ -316,10 +316,10 @@ def collect_modes(targets: StructureTarget, fits: Fits, num_modes: int) -> Modes
     structure = np.repeat(np.arange(num_structures), num_modes)
     dtype = targets.log_prior.dtype
     return Modes(
-        structure=jnp.broadcast_to(
-            jnp.asarray(structure, jnp.int32), (num_objects, total)
+        structure=on_device(
+            np.broadcast_to(structure, (num_objects, total)), np.dtype(np.int32)
         ),
-        z=jnp.asarray(z, dtype),
-        precision=jnp.asarray(precision, dtype),
-        log_density=jnp.asarray(value, dtype),
+        z=on_device(z, dtype),
+        precision=on_device(precision, dtype),
+        log_density=on_device(value, dtype),
     )

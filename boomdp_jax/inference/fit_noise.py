@@ -4,13 +4,15 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from boomdp_jax.core.arrays import on_device
+from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.inference.fit import Fits
 from boomdp_jax.inference.kalman import Filtered, NoiseLevel, extended_filter
 from boomdp_jax.inference.target import StructureTarget
 
+_INDEX = np.dtype(np.int32)
 # Points filtered by one call of the compiled program.
 _POINTS_PER_CALL = 8
 # Prior of the impulses: log-normal about this share of the prior scale of velocity and
@@ -30,7 +32,7 @@ class NoiseFit(NamedTuple):
     """`[object, body, 2]`."""
 
 
-@eqx.filter_jit
+@QuickCompile
 def _filter_points(targets: StructureTarget, index, structure, z, noise: NoiseLevel):
     def one(i, k, z, noise):
         target = jax.tree.map(lambda leaf: leaf[i], targets)
@@ -69,12 +71,12 @@ def filter_points(
         calls.append(
             _filter_points(
                 targets,
-                jnp.asarray(index[rows], jnp.int32),
-                jnp.asarray(structure[rows], jnp.int32),
-                jnp.asarray(z[rows], dtype),
+                on_device(index[rows], _INDEX),
+                on_device(structure[rows], _INDEX),
+                on_device(z[rows], dtype),
                 NoiseLevel(
-                    jnp.asarray(noise.reading[rows], dtype),
-                    jnp.asarray(noise.impulse[rows], dtype),
+                    on_device(noise.reading[rows], dtype),
+                    on_device(noise.impulse[rows], dtype),
                 ),
             )
         )
@@ -173,12 +175,13 @@ def with_gains(
     )
     dtype = targets.log_prior.dtype
     gains = jax.tree.map(
-        lambda leaf: jnp.asarray(leaf, dtype).reshape(
-            num_objects, num_structures, *leaf.shape[1:]
+        lambda leaf: on_device(
+            np.asarray(leaf).reshape(num_objects, num_structures, *leaf.shape[1:]),
+            dtype,
         ),
         found.gains,
     )
-    reference = jnp.asarray(noise.reading, dtype)
+    reference = on_device(noise.reading, dtype)
     return eqx.tree_at(
         lambda t: (t.log_likelihood.gains, t.log_likelihood.reference),
         targets,

@@ -2,10 +2,10 @@
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 
+from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.inference.fit import Fits, FitSettings, Host, best_of_each, make_fits
 from boomdp_jax.inference.seeds import random_starts, seed_coordinates
 from boomdp_jax.inference.target import StructureTarget
@@ -25,7 +25,7 @@ class Guesses(NamedTuple):
         return cls(np.asarray(z, float), np.asarray(has))
 
 
-@eqx.filter_jit
+@QuickCompile
 def _guesses(targets: StructureTarget):
     likelihood: Any = targets.log_likelihood
     return jax.vmap(lambda x: seed_coordinates(x.coordinates, x.data.steps))(likelihood)

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar
@@ -50,9 +51,9 @@ class Filtered(NamedTuple):
     log_likelihood: FloatScalar
 
 
-def channel_scale(reading: Float[Array, "body 4"]) -> Float[Array, "body 6"]:
-    """Noise of every channel from that of the groups."""
-    return reading[:, jnp.asarray(_GROUP)]
+def channel_scale(reading):
+    """Noise of every channel `[body, 6]` from that of the groups `[body, 4]`."""
+    return reading[:, np.asarray(_GROUP)]
 
 
 def extended_filter(

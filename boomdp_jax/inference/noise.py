@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from boomdp_jax.core.arrays import FloatScalar, IntScalar, Key
+from boomdp_jax.core.arrays import FloatScalar, IntScalar, Key, on_device
 
 NUM_CHOICES = 4
 
@@ -72,14 +72,14 @@ def host_noise(
 ) -> Noise:
     """The same as `draw_noise`, for a batch of proposals, drawn on the host."""
 
-    def normal(num: int) -> Array:
-        return jnp.asarray(rng.standard_normal((*shape, num)), dtype)
+    def normal(num: int) -> np.ndarray:
+        return rng.standard_normal((*shape, num))
 
     return Noise(
-        choice=jnp.asarray(_open_unit(rng, (*shape, NUM_CHOICES)), dtype),
-        turn=jnp.asarray(_open_unit(rng, (*shape, dim)) - 0.5, dtype),
-        normal=normal(dim),
-        square=normal(degrees_of_freedom + dim) ** 2,
+        choice=on_device(_open_unit(rng, (*shape, NUM_CHOICES)), dtype),
+        turn=on_device(_open_unit(rng, (*shape, dim)) - 0.5, dtype),
+        normal=on_device(normal(dim), dtype),
+        square=on_device(normal(degrees_of_freedom + dim) ** 2, dtype),
     )
 
 

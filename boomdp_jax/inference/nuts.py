@@ -169,16 +169,16 @@ def _block_draws(spec: SceneSpec, block: Block, draws: NutsDraws) -> BlockDraws:
     num_draws = num_chains * num_samples
 
     def flat(leaf):
-        return leaf.reshape(1, num_draws, *leaf.shape[2:])
+        return np.asarray(leaf).reshape(1, num_draws, *leaf.shape[2:])
 
     verdict = draws.diagnostics
     named = [_named(spec, block, reason) for reason in verdict.reasons]
     return BlockDraws(
-        structure=jnp.zeros((1, num_draws), jnp.int32),
+        structure=np.zeros((1, num_draws), np.int32),
         z=flat(draws.z),
         log_density=flat(draws.log_density),
         noise_scale=flat(draws.noise_scale),
-        log_evidence=jnp.full(1, jnp.nan),
+        log_evidence=np.full(1, np.nan),
         importance_probability=jnp.ones((1, 1)),
         importance_size=jnp.full(1, jnp.nan),
         diagnostics=[verdict._replace(reasons=named)],

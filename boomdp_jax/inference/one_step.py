@@ -17,9 +17,10 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from boomdp_jax.core.arrays import FloatScalar, Key
+from boomdp_jax.core.arrays import FloatScalar, Key, on_device
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.coordinates import Coordinates
 from boomdp_jax.physics.params import Params
@@ -57,15 +58,21 @@ def readings(history: History, bodies: tuple[int, ...], is_uniform: bool) -> Rea
     Returns:
         Readings; a row whose first reading is incomplete does not count.
     """
-    index = jnp.asarray(bodies)
-    is_whole = jnp.all(history.state_mask[:, index], axis=(-2, -1), keepdims=True)
-    counts = history.next_state_mask[:, index] & history.mask[:, None, None] & is_whole
+    index, dtype = np.asarray(bodies), history.state.dtype
+
+    def pick(array):
+        return np.asarray(array)[:, index]
+
+    is_whole = np.all(pick(history.state_mask), axis=(-2, -1), keepdims=True)
+    counts = pick(history.next_state_mask) & is_whole
+    counts &= np.asarray(history.mask)[:, None, None]
+    dt = np.asarray(history.dt)
     return Readings(
-        state=history.state[:, index],
-        action=history.action[:, index],
-        next_state=history.next_state[:, index],
-        mask=counts.astype(history.state.dtype),
-        dt=history.dt[0] if is_uniform else history.dt,
+        state=on_device(pick(history.state), dtype),
+        action=on_device(pick(history.action), dtype),
+        next_state=on_device(pick(history.next_state), dtype),
+        mask=on_device(counts, dtype),
+        dt=on_device(dt[0] if is_uniform else dt, dtype),
     )
 
 

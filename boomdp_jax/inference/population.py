@@ -18,9 +18,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-from boomdp_jax.core.arrays import Key
+from boomdp_jax.core.arrays import Key, on_device
+from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.inference.importance_evidence import (
     ImportanceEvidence,
 )
@@ -119,7 +120,7 @@ def sample_population(
             batch = _proposals(move, rng, points, targets, mixtures, step_size)
             points, info = _verdict(rng, points, targets, batch, evaluate)
             if move == "walk" and is_warm_up:
-                rate = np.asarray(jnp.mean(info.accept_probability, axis=1), float)
+                rate = np.mean(np.asarray(info.accept_probability, float), axis=1)
                 step_size = np.clip(step_size * np.exp(rate - _WALK_ACCEPT), 0.02, 0.98)
             if not is_warm_up:
                 _count(proposed, accepted, MOVES.index(move), info)
@@ -136,7 +137,7 @@ def sample_population(
     )
 
 
-@eqx.filter_jit
+@QuickCompile
 def _fit_spare(targets, mixtures, mean, scale_tril, share):
     return jax.vmap(fit_spare_components)(targets, mixtures, mean, scale_tril, share)
 
@@ -174,7 +175,7 @@ def _adapt(
         mean[i, k] -= np.where(is_angle, turn * np.round(mean[i, k] / turn), 0.0)
         share[i, k] = _SPARE_SHARE
     dtype = points.z.dtype
-    parts = (jnp.asarray(part, dtype) for part in (mean, tril, share))
+    parts = (on_device(part, dtype) for part in (mean, tril, share))
     return _fit_spare(targets, mixtures, *parts)
 
 
@@ -205,17 +206,21 @@ def _start(
             rows[i, chain] = mine[np.minimum(place, len(mine) - 1)]
     rows = rows.reshape(num_objects, -1)
     each = np.arange(num_objects)[:, None]
-    structure = evidence.structure[each, rows]
-    z = evidence.z[each, rows]
+
+    def pick_rows(array):
+        picked = np.asarray(array)[each, rows]
+        return on_device(picked, picked.dtype)
+
+    structure, z = pick_rows(evidence.structure), pick_rows(evidence.z)
     return Point(
         structure=structure,
         z=z,
-        log_density=evidence.log_density[each, rows],
+        log_density=pick_rows(evidence.log_density),
         log_proposal=_log_proposal(targets, mixtures, structure, z),
     )
 
 
-@eqx.filter_jit
+@QuickCompile
 def _log_proposal(targets, mixtures, structure, z):
     def one(target, mixture, structure, z):
         return jax.vmap(lambda k, z: mixture.log_density(target, k, z))(structure, z)
@@ -230,7 +235,7 @@ class _Batch(NamedTuple):
     log_proposal: Float[Array, "object walker"]
 
 
-@eqx.filter_jit
+@QuickCompile
 def _propose(
     move: str,
     noise: Noise,
@@ -264,7 +269,7 @@ def _propose(
     return over(noise, points, targets, mixtures, step_size)
 
 
-@eqx.filter_jit
+@QuickCompile
 def _decide(
     points: Point, batch: _Batch, log_density, uniform
 ) -> tuple[Point, MoveInfo]:
@@ -293,7 +298,7 @@ def _proposals(
 ) -> _Batch:
     """A proposal of every walker."""
     noise = batch_noise(rng, targets, mixtures, points.structure.shape[1])
-    size = jnp.asarray(step_size, points.z.dtype)
+    size = on_device(step_size, points.z.dtype)
     return _propose(move, noise, points, targets, mixtures, size)
 
 
@@ -308,7 +313,7 @@ def _verdict(
     proposal, dtype = batch.proposal, points.z.dtype
     log_density = evaluate(targets, proposal.structure, proposal.z).astype(dtype)
     # Which choices a proposal makes is its own affair; the verdict gets a fresh number.
-    uniform = jnp.asarray(1.0 - rng.random(points.structure.shape), dtype)
+    uniform = on_device(1.0 - rng.random(points.structure.shape), dtype)
     return _decide(points, batch, log_density, uniform)
 
 
@@ -324,10 +329,10 @@ def _arrange(kept: list[Point], settings: PopulationSettings) -> ChainDraws:
     """Sweeps put together, walker after walker within each chain."""
 
     def whole(name: str) -> Array:
-        stacked = jnp.stack([getattr(points, name) for points in kept], axis=2)
+        parts = [np.asarray(getattr(points, name)) for points in kept]
+        stacked = np.stack(parts, axis=2)
         num_objects = stacked.shape[0]
         shape = (num_objects, settings.num_chains, -1, *stacked.shape[3:])
-        return stacked.reshape(shape)
+        return on_device(stacked.reshape(shape), stacked.dtype)
 
-    structure: Int[Array, "object chain draw"] = whole("structure")
-    return ChainDraws(structure, whole("z"), whole("log_density"))
+    return ChainDraws(whole("structure"), whole("z"), whole("log_density"))

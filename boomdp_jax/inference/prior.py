@@ -4,8 +4,9 @@ import math
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from boomdp_jax.core.arrays import on_device
 
 
 class Scale(NamedTuple):
@@ -165,16 +166,15 @@ def prior_scales(options: PriorOptions) -> PriorScales:
     """The numbers of a prior as arrays."""
     return PriorScales(
         center={
-            name: jnp.asarray(
-                math.log(scale.center) if name in LOGARITHMIC else scale.center, float
+            name: on_device(
+                math.log(scale.center) if name in LOGARITHMIC else scale.center
             )
             for name, scale in options.scales.items()
         },
         spread={
-            name: jnp.asarray(scale.spread, float)
-            for name, scale in options.scales.items()
+            name: on_device(scale.spread) for name, scale in options.scales.items()
         },
-        noise=jnp.asarray([options.noise[group] for group in NOISE_GROUPS], float),
+        noise=on_device([options.noise[group] for group in NOISE_GROUPS]),
     )
 
 

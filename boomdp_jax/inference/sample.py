@@ -3,13 +3,12 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-from boomdp_jax.core.arrays import Key
+from boomdp_jax.core.arrays import Key, on_device
+from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics, diagnose_chains
 from boomdp_jax.inference.compile_ahead import CompileAhead, signature
 from boomdp_jax.inference.evaluate import evaluate_points
@@ -59,13 +58,19 @@ class SampleSettings(NamedTuple):
 
 
 class BlockDraws(NamedTuple):
-    """What sampling a batch of equal blocks gives, leading axis `object`."""
+    """What sampling a batch of equal blocks gives; leading axis `object`, on the host.
 
-    structure: Int[Array, "object draw"]
-    z: Float[Array, "object draw dim"]
-    log_density: Float[Array, "object draw"]
-    noise_scale: Float[Array, "object draw body 4"]
-    log_evidence: Float[Array, " object"]
+    `[object, draw, ...]` unless a field says otherwise.
+    """
+
+    structure: np.ndarray
+    z: np.ndarray
+    """`[object, draw, dim]`."""
+    log_density: np.ndarray
+    noise_scale: np.ndarray
+    """`[object, draw, body, 4]`."""
+    log_evidence: np.ndarray
+    """`[object]`."""
     importance_probability: Float[Array, "object structure"]
     """Structure probabilities by importance sampling, a cross-check."""
     importance_size: Float[Array, " object"]
@@ -74,7 +79,7 @@ class BlockDraws(NamedTuple):
     """Index of each chain; draws lie chain after chain."""
 
 
-@eqx.filter_jit
+@QuickCompile
 def start_mixtures(targets: StructureTarget, modes: Modes) -> LaplaceMixture:
     """Proposal mixtures: fitted modes, modes times priors, and the prior."""
 
@@ -118,16 +123,15 @@ def sample_blocks(
     population = sample_population(chain_key, targets, mixtures, settings.population)
     draws, evidence = population.draws, population.evidence
     num_objects = targets.structures.shape[0]
-    structure = draws.structure.reshape(num_objects, -1)
-    z = draws.z.reshape(*structure.shape, -1)
+    structure = np.asarray(draws.structure).reshape(num_objects, -1)
+    z = np.asarray(draws.z).reshape(*structure.shape, -1)
+    log_joint = np.asarray(evidence.log_evidence, float) + np.asarray(targets.log_prior)
     return BlockDraws(
         structure=structure,
         z=z,
-        log_density=draws.log_density.reshape(structure.shape),
+        log_density=np.asarray(draws.log_density).reshape(structure.shape),
         noise_scale=_noise(noise_key, targets, structure, z),
-        log_evidence=jax.nn.logsumexp(
-            evidence.log_evidence + targets.log_prior, axis=-1
-        ),
+        log_evidence=np.logaddexp.reduce(log_joint, axis=-1),
         importance_probability=evidence.probability,
         importance_size=evidence.effective_sample_size,
         diagnostics=[_diagnose(targets, population, i) for i in range(num_objects)],
@@ -146,23 +150,23 @@ def _rehearse(key: Key, targets: StructureTarget, settings: SampleSettings) -> N
     filter_points(targets, first, first, np.zeros((1, dim)), noise)
     num_modes = num_structures * settings.fit.num_modes
     dtype = targets.log_prior.dtype
-    structure = jnp.repeat(
-        jnp.arange(num_structures, dtype=jnp.int32), settings.fit.num_modes
-    )
+    structure = np.repeat(np.arange(num_structures), settings.fit.num_modes)
+    structure = np.broadcast_to(structure, (num_objects, num_modes))
+    precision = np.broadcast_to(np.eye(dim), (num_objects, num_modes, dim, dim))
     modes = Modes(
-        structure=jnp.broadcast_to(structure[None], (num_objects, num_modes)),
-        z=jnp.zeros((num_objects, num_modes, dim), dtype),
-        precision=jnp.broadcast_to(
-            jnp.eye(dim, dtype=dtype), (num_objects, num_modes, dim, dim)
-        ),
-        log_density=jnp.zeros((num_objects, num_modes), dtype),
+        structure=on_device(structure, np.dtype(np.int32)),
+        z=on_device(np.zeros((num_objects, num_modes, dim)), dtype),
+        precision=on_device(precision, dtype),
+        log_density=on_device(np.zeros((num_objects, num_modes)), dtype),
     )
     sample_population(
         key,
         targets,
         start_mixtures(targets, modes),
         settings.population._replace(num_warmup=1, num_sweeps=1),
-        evaluate=lambda targets, structure, z: jnp.zeros(structure.shape, dtype),
+        evaluate=lambda targets, structure, z: on_device(
+            np.zeros(structure.shape), dtype
+        ),
     )
 
 
@@ -172,7 +176,7 @@ def _diagnose(
     """Judge one object."""
 
     def pick(tree):
-        return jax.tree.map(lambda leaf: leaf[index], tree)
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[index], tree)
 
     counts = population.counts
     return diagnose_chains(
@@ -182,15 +186,15 @@ def _diagnose(
     )
 
 
-def _noise(key: Key, targets: StructureTarget, structure, z) -> Array:
+def _noise(key: Key, targets: StructureTarget, structure, z) -> np.ndarray:
     """Noise scales given every draw, from their inverse-gamma distribution."""
     num_objects, num_draws = structure.shape
     index = np.repeat(np.arange(num_objects), num_draws)
     found = evaluate_points(
         targets,
         index,
-        np.asarray(structure).reshape(-1),
-        np.asarray(z).reshape(num_objects * num_draws, -1),
+        structure.reshape(-1),
+        z.reshape(num_objects * num_draws, -1),
     )
     likelihood: Any = targets.log_likelihood
     reference = np.asarray(likelihood.reference, float)
@@ -199,4 +203,4 @@ def _noise(key: Key, targets: StructureTarget, structure, z) -> Array:
     rate = scale[index] ** 2 + 0.5 * found.square
     draws = host_generator(key).gamma(shape)
     sd = reference[index] * np.sqrt(rate / draws)
-    return jnp.asarray(sd, z.dtype).reshape(num_objects, num_draws, *sd.shape[1:])
+    return sd.astype(z.dtype).reshape(num_objects, num_draws, *sd.shape[1:])

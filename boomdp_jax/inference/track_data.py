@@ -1,9 +1,10 @@
 """Readings in the order in which a filter takes them: start, second reading, next."""
 
 import equinox as eqx
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from boomdp_jax.core.arrays import on_device
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.one_step import Readings, readings
 
@@ -43,25 +44,24 @@ def track_data(
         The readings. A missing first reading of a track is replaced by the mean
         position, or by rest; how little is known of it is up to the filter.
     """
-    index = jnp.asarray(bodies)
+    index = np.asarray(bodies)
     steps = readings(history, bodies, is_uniform)
     dtype = steps.state.dtype
-    rows = history.mask
-    first = history.state_mask[:, index] & rows[:, None, None]
-    last = history.next_state_mask[:, index] & rows[:, None, None]
-    same = jnp.zeros(rows.shape, bool)
-    if rows.shape[0] > 1:
-        episode = history.episode
-        same = same.at[1:].set((episode[1:] == episode[:-1]) & rows[:-1])
+    state, rows = np.asarray(steps.state), np.asarray(history.mask)
+    first = np.asarray(history.state_mask)[:, index] & rows[:, None, None]
+    last = np.asarray(history.next_state_mask)[:, index] & rows[:, None, None]
+    episode = np.asarray(history.episode)
+    same = np.zeros(rows.shape, bool)
+    same[1:] = (episode[1:] == episode[:-1]) & rows[:-1]
     goes_on = rows & same
-    num = jnp.maximum(jnp.sum(first, axis=0), 1)
-    mean = jnp.sum(jnp.where(first, steps.state, 0.0), axis=0) / num
-    guess = jnp.where(jnp.arange(6)[None] < 3, mean, 0.0)
+    num = np.maximum(np.sum(first, axis=0), 1)
+    mean = np.sum(np.where(first, state, 0.0), axis=0) / num
+    guess = np.where(np.arange(6)[None] < 3, mean, 0.0)
     return TrackData(
         steps=steps,
-        first_mask=first.astype(dtype),
-        last_mask=last.astype(dtype),
-        is_start=(~goes_on).astype(dtype),
-        is_second=(goes_on & ~history.is_chained).astype(dtype),
-        start=jnp.where(first, steps.state, guess[None]),
+        first_mask=on_device(first, dtype),
+        last_mask=on_device(last, dtype),
+        is_start=on_device(~goes_on, dtype),
+        is_second=on_device(goes_on & ~np.asarray(history.is_chained), dtype),
+        start=on_device(np.where(first, state, guess[None]), dtype),
     )

@@ -18,9 +18,10 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from boomdp_jax.core.arrays import FloatScalar
+from boomdp_jax.core.arrays import FloatScalar, on_device
 from boomdp_jax.inference.track_data import TrackData
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
@@ -63,23 +64,25 @@ class Gains(eqx.Module):
         return jnp.sum(logs, axis=(-3, -2, -1))
 
 
-def one_step_gains(data: TrackData, scale: Float[Array, "body 6"]) -> Gains:
+def one_step_gains(data: TrackData, scale: np.ndarray) -> Gains:
     """Gains that believe every first reading and learn nothing from the last.
 
     Args:
         data: the readings.
-        scale: by which innovations are divided, per channel.
+        scale: by which innovations are divided, `[body, 6]`.
 
     Returns:
         Gains under which tracking is one-step prediction.
     """
     num_rows = data.first_mask.shape[0]
     num = data.steps.state.shape[1] * 6
-    goes_on = (1.0 - data.is_start)[:, None, None]
-    identity = jnp.broadcast_to(jnp.eye(num), (num_rows, num, num))
-    counts = data.steps.mask.reshape(num_rows, num) / scale.reshape(-1)[None]
-    zero = jnp.zeros_like(identity)
-    return Gains(goes_on * identity, zero, zero, identity * counts[:, None, :])
+    goes_on = 1.0 - np.asarray(data.is_start)[:, None, None]
+    identity = np.broadcast_to(np.eye(num), (num_rows, num, num))
+    counts = np.asarray(data.steps.mask).reshape(num_rows, num)
+    counts = counts / np.asarray(scale).reshape(-1)[None]
+    parts = (goes_on * identity, 0.0 * identity, 0.0 * identity)
+    parts = (*parts, identity * counts[:, None, :])
+    return Gains(*(on_device(part) for part in parts))
 
 
 def channel_difference(

@@ -2,13 +2,12 @@
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from boomdp_jax.core.arrays import Key
+from boomdp_jax.core.arrays import Key, on_device
+from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.inference.evaluate import evaluate_points
 from boomdp_jax.inference.importance_evidence import (
     ImportanceEvidence,
@@ -51,12 +50,12 @@ def weigh_twice(
     return mixtures, _weigh(rng, targets, mixtures, num_draws, evaluate)
 
 
-@eqx.filter_jit
+@QuickCompile
 def _draw(offset, noise, targets: StructureTarget, mixtures: LaplaceMixture):
     return jax.vmap(draws_of_noise)(offset, noise, targets, mixtures)
 
 
-@eqx.filter_jit
+@QuickCompile
 def _weigh_all(targets: StructureTarget, draws, log_density):
     return jax.vmap(weigh_draws)(targets, draws, log_density)
 
@@ -71,7 +70,7 @@ def _weigh(
     """Draw from mixtures and weigh the draws."""
     num_objects = targets.structures.shape[0]
     noise = batch_noise(rng, targets, mixtures, num_draws)
-    offset = jnp.asarray(rng.random(num_objects), noise.normal.dtype)
+    offset = on_device(rng.random(num_objects), noise.normal.dtype)
     draws = _draw(offset, noise, targets, mixtures)
     return _weigh_all(targets, draws, evaluate(targets, draws.structure, draws.z))
 
@@ -101,10 +100,10 @@ def evaluate_each(
         np.asarray(structure).reshape(-1),
         np.asarray(z).reshape(num_objects * num, -1),
     )
-    return jnp.asarray(found.log_density.reshape(num_objects, num))
+    return on_device(found.log_density.reshape(num_objects, num))
 
 
-@eqx.filter_jit
+@QuickCompile
 def _refine(targets: StructureTarget, mixtures: LaplaceMixture, evidence):
     return jax.vmap(
         lambda t, m, e: refine_weights(t, m, e.structure, e.z, e.log_weight)

@@ -1,8 +1,10 @@
 """Φ: every latent physical number of one hypothesis, in fixed slots with masks."""
 
 import equinox as eqx
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+
+from boomdp_jax.core.arrays import on_device
 
 WORLD = -1
 """Index that stands for the world as a joint's partner."""
@@ -103,31 +105,33 @@ def empty_params(
 
     def joint_slots(num: int) -> dict:
         return {
-            "active": jnp.zeros(num, bool),
-            "body_a": jnp.zeros(num, jnp.int32),
-            "body_b": jnp.full(num, WORLD, jnp.int32),
-            "anchor_a": jnp.zeros((num, 2)),
-            "anchor_b": jnp.zeros((num, 2)),
+            "active": on_device(np.zeros(num), bool),
+            "body_a": on_device(np.zeros(num), np.dtype(np.int32)),
+            "body_b": on_device(np.full(num, WORLD), np.dtype(np.int32)),
+            "anchor_a": on_device(np.zeros((num, 2))),
+            "anchor_b": on_device(np.zeros((num, 2))),
         }
 
     return Params(
-        density=jnp.full(num_bodies, density, float),
+        density=on_device(np.full(num_bodies, density)),
         revolute=Revolute(
             **joint_slots(num_revolute),
-            viscous=jnp.zeros(num_revolute),
-            dry=jnp.zeros(num_revolute),
+            viscous=on_device(np.zeros(num_revolute)),
+            dry=on_device(np.zeros(num_revolute)),
         ),
-        distance=Distance(**joint_slots(num_distance), length=jnp.zeros(num_distance)),
+        distance=Distance(
+            **joint_slots(num_distance), length=on_device(np.zeros(num_distance))
+        ),
         wheel=Wheel(
-            active=jnp.zeros((num_bodies, num_wheel), bool),
-            position=jnp.zeros((num_bodies, num_wheel, 2)),
-            heading=jnp.zeros((num_bodies, num_wheel)),
-            viscous=jnp.zeros((num_bodies, num_wheel, 2)),
-            dry=jnp.zeros((num_bodies, num_wheel, 2)),
+            active=on_device(np.zeros((num_bodies, num_wheel)), bool),
+            position=on_device(np.zeros((num_bodies, num_wheel, 2))),
+            heading=on_device(np.zeros((num_bodies, num_wheel))),
+            viscous=on_device(np.zeros((num_bodies, num_wheel, 2))),
+            dry=on_device(np.zeros((num_bodies, num_wheel, 2))),
         ),
         ground=Ground(
-            active=jnp.zeros((num_bodies, num_ground), bool),
-            dry=jnp.zeros((num_bodies, num_ground)),
-            viscous=jnp.zeros((num_bodies, num_ground)),
+            active=on_device(np.zeros((num_bodies, num_ground)), bool),
+            dry=on_device(np.zeros((num_bodies, num_ground))),
+            viscous=on_device(np.zeros((num_bodies, num_ground))),
         ),
     )

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from boomdp_jax.core.arrays import on_device
 from boomdp_jax.physics.body_spec import BodySpec
 from boomdp_jax.physics.constraint_spec import ConstraintSpec, missing_numbers
 from boomdp_jax.physics.params import (
@@ -55,17 +55,17 @@ def build_scene(
     # Concrete arrays even under a trace: the caller keeps them.
     with jax.ensure_compile_time_eval():
         return Scene(
-            vertices=jnp.asarray(np.stack(vertices), float),
-            vertex_mask=jnp.asarray(np.stack(vertex_mask)),
-            radius=jnp.asarray([body.radius for body in bodies], float),
-            area=jnp.asarray([body.area for body in bodies], float),
-            gyration=jnp.asarray([body.gyration for body in bodies], float),
-            feet=jnp.asarray(np.stack(feet), float),
-            foot_load=jnp.asarray(np.stack(loads), float),
-            is_static=jnp.asarray([body.is_static for body in bodies], bool),
-            gravity=jnp.asarray(gravity, float),
-            normal_gravity=jnp.asarray(normal_gravity, float),
-            dt=jnp.asarray(dt, float),
+            vertices=on_device(np.stack(vertices)),
+            vertex_mask=on_device(np.stack(vertex_mask), bool),
+            radius=on_device([body.radius for body in bodies]),
+            area=on_device([body.area for body in bodies]),
+            gyration=on_device([body.gyration for body in bodies]),
+            feet=on_device(np.stack(feet)),
+            foot_load=on_device(np.stack(loads)),
+            is_static=on_device([body.is_static for body in bodies], bool),
+            gravity=on_device(gravity),
+            normal_gravity=on_device(normal_gravity),
+            dt=on_device(dt),
         )
 
 
@@ -102,7 +102,7 @@ def build_params(
     }
     density = [1.0 if body.density is None else body.density for body in bodies]
     return Params(
-        density=jnp.asarray(density, float),
+        density=on_device(density),
         revolute=Revolute(
             **_joint_slots(joints["revolute"]),
             viscous=_stack(joints["revolute"], "viscous"),
@@ -143,14 +143,14 @@ def _stack(
     constraints: Sequence[ConstraintSpec], key: str, shape: tuple[int, ...] = ()
 ) -> jax.Array:
     rows = [constraint.numbers[key] for constraint in constraints]
-    return jnp.asarray(np.reshape(rows, (len(rows), *shape)), float)
+    return on_device(np.reshape(rows, (len(rows), *shape)))
 
 
 def _joint_slots(joints: Sequence[ConstraintSpec]) -> dict[str, jax.Array]:
     return {
-        "active": jnp.ones(len(joints), bool),
-        "body_a": jnp.asarray([joint.body_a for joint in joints], jnp.int32),
-        "body_b": jnp.asarray([joint.body_b for joint in joints], jnp.int32),
+        "active": on_device(np.ones(len(joints)), bool),
+        "body_a": on_device([joint.body_a for joint in joints], np.dtype(np.int32)),
+        "body_b": on_device([joint.body_b for joint in joints], np.dtype(np.int32)),
         "anchor_a": _stack(joints, "anchor_a", (2,)),
         "anchor_b": _stack(joints, "anchor_b", (2,)),
     }
@@ -178,6 +178,6 @@ def _body_slots(
             for key, array in arrays.items():
                 array[body, slot] = constraint.numbers[key]
     return {
-        "active": jnp.asarray(active),
-        **{key: jnp.asarray(array, float) for key, array in arrays.items()},
+        "active": on_device(active, bool),
+        **{key: on_device(array) for key, array in arrays.items()},
     }
