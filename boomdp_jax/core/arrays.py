@@ -1,9 +1,10 @@
 """Array aliases: the shapes and dtypes that the rest of the package speaks in."""
 
+from typing import Any
+
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
-from numpy.typing import ArrayLike
 
 FloatScalar = Float[Array, ""]
 IntScalar = Int[Array, ""]
@@ -14,14 +15,14 @@ Key = PRNGKeyArray
 __all__ = ["BoolScalar", "FloatScalar", "IntScalar", "Key", "Vector2", "on_device"]
 
 
-def on_device(values: ArrayLike, dtype: type | np.dtype = float) -> Array:
+def on_device(values: Any, dtype: type | np.dtype = float) -> Array:
     """An array of JAX from numbers on the host, converted there.
 
     `jnp.asarray` compiles a program for every new shape, ten to thirty milliseconds
     each, which set-up code with its many small arrays pays in seconds.
 
     Args:
-        values: concrete numbers.
+        values: concrete numbers, as NumPy takes them.
         dtype: `float`, `int` and `bool` stand for the default type of that kind.
 
     Returns:

@@ -2,8 +2,9 @@
 
 Points come as a flat list on the host. They are sorted into chunks of equal object and
 structure, so that data and gains are read once for a chunk and products with gains
-vectorise, and handed out in calls of one size: whatever is fitted, weighed or sampled,
-and however many objects there are, the physics is compiled once.
+vectorise, and handed out in calls of one size, as many at a time as there are cores:
+whatever is fitted, weighed or sampled, and however many objects there are, the physics
+is compiled once.
 """
 
 from typing import Any, NamedTuple
@@ -15,11 +16,12 @@ from jaxtyping import Array, Bool
 
 from boomdp_jax.core.arrays import on_device
 from boomdp_jax.core.quick_compile import QuickCompile
+from boomdp_jax.core.side_by_side import call_each
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.tracking import Gains
 
 _CHUNK = 32
-_CHUNKS_PER_CALL = 8
+_CHUNKS_PER_CALL = 4
 
 
 class Evaluation(NamedTuple):
@@ -70,6 +72,14 @@ def _evaluate_chunks(chunks: _Chunks, z):
     return jax.vmap(one_chunk)(chunks, z)
 
 
+def _call(targets: StructureTarget, index, structure, z):
+    """One call of the compiled program, its result on the host."""
+    number = np.dtype(np.int32)
+    chunks = _gather(targets, on_device(index, number), on_device(structure, number))
+    found = _evaluate_chunks(chunks, on_device(z, targets.log_prior.dtype))
+    return jax.tree.map(np.asarray, found)
+
+
 def log_prior_density(
     targets: StructureTarget, index: np.ndarray, structure: np.ndarray, z: np.ndarray
 ) -> np.ndarray:
@@ -113,8 +123,7 @@ def evaluate_points(
     )
     num_chunks = -(-sizes // _CHUNK)
     total = int(num_chunks.sum())
-    num_calls = -(-total // _CHUNKS_PER_CALL)
-    padded = num_calls * _CHUNKS_PER_CALL
+    padded = -(-total // _CHUNKS_PER_CALL) * _CHUNKS_PER_CALL
     # Which point fills each place; places left over repeat their group's first point.
     source = np.zeros((padded, _CHUNK), np.int64)
     owner = np.zeros(padded, np.int64)
@@ -127,21 +136,20 @@ def evaluate_points(
         first += count
     if first:
         source[first:], owner[first:] = source[0, 0], owner[0]
-    dtype = np.dtype(targets.log_prior.dtype)
-    calls = []
-    for number in range(num_calls):
-        rows = slice(number * _CHUNKS_PER_CALL, (number + 1) * _CHUNKS_PER_CALL)
-        chunks = _gather(
-            targets,
-            on_device(owner[rows] // num_structures, np.dtype(np.int32)),
-            on_device(owner[rows] % num_structures, np.dtype(np.int32)),
-        )
-        calls.append(_evaluate_chunks(chunks, on_device(z[source[rows]], dtype)))
+    parts = [slice(n, n + _CHUNKS_PER_CALL) for n in range(0, padded, _CHUNKS_PER_CALL)]
+    calls = call_each(
+        _call,
+        [
+            (targets, *divmod(owner[rows], num_structures), z[source[rows]])
+            for rows in parts
+        ],
+        targets,
+    )
     flat = source[:total].reshape(-1)
 
     def gather(pick):
-        parts = [np.asarray(pick(call)) for call in calls]
-        joined = np.concatenate(parts).reshape(-1, *parts[0].shape[2:])[: flat.size]
+        found = np.concatenate([pick(call) for call in calls])
+        joined = found.reshape(-1, *found.shape[2:])[: flat.size]
         out = np.empty((num_points, *joined.shape[1:]), joined.dtype)
         out[flat] = joined
         return out

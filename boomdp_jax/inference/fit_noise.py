@@ -8,6 +8,7 @@ import numpy as np
 
 from boomdp_jax.core.arrays import on_device
 from boomdp_jax.core.quick_compile import QuickCompile
+from boomdp_jax.core.side_by_side import call_each
 from boomdp_jax.inference.fit import Fits
 from boomdp_jax.inference.kalman import Filtered, NoiseLevel, extended_filter
 from boomdp_jax.inference.target import StructureTarget
@@ -44,6 +45,10 @@ def _filter_points(targets: StructureTarget, index, structure, z, noise: NoiseLe
     return jax.vmap(one)(index, structure, z, noise)
 
 
+def _filter_on_host(*arguments):
+    return jax.tree.map(np.asarray, _filter_points(*arguments))
+
+
 def filter_points(
     targets: StructureTarget,
     index: np.ndarray,
@@ -65,24 +70,23 @@ def filter_points(
     """
     num = len(index)
     dtype = targets.log_prior.dtype
-    calls = []
+    inputs = []
     for begin in range(0, num, _POINTS_PER_CALL):
         rows = np.minimum(np.arange(begin, begin + _POINTS_PER_CALL), num - 1)
-        calls.append(
-            _filter_points(
+        level = NoiseLevel(
+            on_device(noise.reading[rows], dtype), on_device(noise.impulse[rows], dtype)
+        )
+        inputs.append(
+            (
                 targets,
                 on_device(index[rows], _INDEX),
                 on_device(structure[rows], _INDEX),
                 on_device(z[rows], dtype),
-                NoiseLevel(
-                    on_device(noise.reading[rows], dtype),
-                    on_device(noise.impulse[rows], dtype),
-                ),
+                level,
             )
         )
-    return jax.tree.map(
-        lambda *parts: np.concatenate([np.asarray(p) for p in parts])[:num], *calls
-    )
+    calls = call_each(_filter_on_host, inputs, targets)
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:num], *calls)
 
 
 def fit_noise(targets: StructureTarget, best: Fits, start: NoiseFit) -> NoiseFit:
