@@ -12,6 +12,8 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 install_import_hook("boomdp_jax", "beartype.beartype")
 
+from boomdp_jax.core import side_by_side  # noqa: E402  After the hook.
+
 
 @pytest.fixture(autouse=True, scope="module")
 def _drop_programs() -> Iterator[None]:
@@ -22,6 +24,7 @@ def _drop_programs() -> Iterator[None]:
     """
     yield
     jax.clear_caches()
+    side_by_side.forget_compiled()
     gc.collect()
 
 

@@ -28,6 +28,11 @@ def _pool() -> concurrent.futures.ThreadPoolExecutor:
     )
 
 
+def forget_compiled() -> None:
+    """Forget what is compiled, as after `jax.clear_caches`."""
+    _compiled.clear()
+
+
 def call_each(
     function: Callable[..., Any], inputs: Sequence[tuple], like: Any
 ) -> list[Any]:

@@ -62,6 +62,9 @@ class PopulationSettings(NamedTuple):
     """Sweeps that are kept; each gives one draw per walker."""
     num_importance: int = 2048
     """Draws from the mixture that refine its weights; and again, that are weighed."""
+    max_doublings: int = 2
+    """How often the number of sweeps may double, of which then every second is kept,
+    where the chains do not agree yet."""
 
 
 class MoveCounts(NamedTuple):
@@ -88,6 +91,7 @@ def sample_population(
     settings: PopulationSettings,
     *,
     evaluate: Callable[..., Array] | None = None,
+    is_mixed: Callable[[ChainDraws], bool] = lambda draws: True,
 ) -> Population:
     """Draw from the posteriors of a batch of objects.
 
@@ -99,6 +103,7 @@ def sample_population(
         evaluate: from targets, structures `[object, point]` and coordinates `[object,
             point, dim]` to log-densities `[object, point]`; default: that of the
             targets, in chunks.
+        is_mixed: whether draws `[object, chain, draw]` of all objects will do.
 
     Returns:
         Draws of every chain, move counts, and evidence by importance sampling.
@@ -113,25 +118,40 @@ def sample_population(
     step_size = np.full(num_objects, 0.5)
     shape = (num_objects, len(MOVES), 2)
     proposed, accepted = np.zeros(shape, int), np.zeros(shape, int)
-    kept = []
-    for sweep in range(settings.num_warmup + settings.num_sweeps):
-        is_warm_up = sweep < settings.num_warmup
+
+    def sweep_once(points: Point, mixtures: LaplaceMixture, is_warm_up: bool) -> Point:
         for move in _CYCLE:
             batch = _proposals(move, rng, points, targets, mixtures, step_size)
             points, info = _verdict(rng, points, targets, batch, evaluate)
-            if move == "walk" and is_warm_up:
-                rate = np.mean(np.asarray(info.accept_probability, float), axis=1)
-                step_size = np.clip(step_size * np.exp(rate - _WALK_ACCEPT), 0.02, 0.98)
             if not is_warm_up:
                 _count(proposed, accepted, MOVES.index(move), info)
-        if not is_warm_up:
+            elif move == "walk":
+                rate = np.mean(np.asarray(info.accept_probability, float), axis=1)
+                step_size[:] *= np.exp(rate - _WALK_ACCEPT)
+                np.clip(step_size, 0.02, 0.98, out=step_size)
+        return points
+
+    for _ in range(settings.num_warmup):
+        points = sweep_once(points, mixtures, True)
+    if settings.num_warmup > 0:
+        mixtures = _adapt(targets, mixtures, points)
+        proposal = _log_proposal(targets, mixtures, points.structure, points.z)
+        points = eqx.tree_at(lambda p: p.log_proposal, points, proposal)
+    kept, every = [], 1
+    for doubling in range(settings.max_doublings + 1):
+        if doubling > 1:
+            every *= 2
+        for _ in range(settings.num_sweeps):
+            for _ in range(every):
+                points = sweep_once(points, mixtures, False)
             kept.append(points)
-        elif sweep == settings.num_warmup - 1:
-            mixtures = _adapt(targets, mixtures, points)
-            proposal = _log_proposal(targets, mixtures, points.structure, points.z)
-            points = eqx.tree_at(lambda p: p.log_proposal, points, proposal)
+        if doubling > 0:
+            kept = kept[1::2]
+        draws = _arrange(kept, settings)
+        if is_mixed(draws):
+            break
     return Population(
-        draws=_arrange(kept, settings),
+        draws=draws,
         counts=MoveCounts(proposed, accepted),
         evidence=evidence,
     )

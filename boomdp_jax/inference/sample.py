@@ -30,7 +30,11 @@ from boomdp_jax.inference.population import (
     PopulationSettings,
     sample_population,
 )
+from boomdp_jax.inference.structure_chain import ChainDraws
 from boomdp_jax.inference.target import StructureTarget
+
+# Chains go on where an R-hat of any object exceeds this.
+_R_HAT = 1.015
 
 
 class SampleSettings(NamedTuple):
@@ -120,7 +124,13 @@ def sample_blocks(
     targets = found.targets
     report("jumping between structures")
     mixtures = start_mixtures(targets, found.modes)
-    population = sample_population(chain_key, targets, mixtures, settings.population)
+    population = sample_population(
+        chain_key,
+        targets,
+        mixtures,
+        settings.population,
+        is_mixed=lambda draws: _is_mixed(targets, draws),
+    )
     draws, evidence = population.draws, population.evidence
     num_objects = targets.structures.shape[0]
     structure = np.asarray(draws.structure).reshape(num_objects, -1)
@@ -170,18 +180,26 @@ def _rehearse(key: Key, targets: StructureTarget, settings: SampleSettings) -> N
     )
 
 
+def _is_mixed(targets: StructureTarget, draws: ChainDraws) -> bool:
+    """Whether the chains of every object agree."""
+    for index in range(targets.structures.shape[0]):
+        verdict = diagnose_chains(*_pick((targets, draws), index))
+        if max(verdict.r_hat.values(), default=1.0) > _R_HAT:
+            return False
+    return True
+
+
+def _pick(tree, index: int):
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[index], tree)
+
+
 def _diagnose(
     targets: StructureTarget, population: Population, index: int
 ) -> ChainDiagnostics:
     """Judge one object."""
-
-    def pick(tree):
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[index], tree)
-
     counts = population.counts
     return diagnose_chains(
-        pick(targets),
-        pick(population.draws),
+        *_pick((targets, population.draws), index),
         MoveCounts(counts.proposed[index][None], counts.accepted[index][None]),
     )
 

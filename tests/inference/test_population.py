@@ -106,3 +106,40 @@ def test_every_move_is_made_and_accepted(population):
     assert accepted[0, 0, 1] > 0
     assert accepted[0, 1, 1] > 0
     assert proposed[0, 2, 1] == 0
+
+
+@pytest.mark.parametrize("num_refusals", [0, 1, 2, 5])
+def test_sweeps_double_until_the_chains_agree(problem, num_refusals):
+    targets, target, laplace = problem
+    mixture = add_spare_components(target, laplace)
+    stacked = jax.tree.map(lambda leaf: leaf[None], mixture)
+    settings = PopulationSettings(
+        num_chains=2, num_walkers=8, num_warmup=1, num_sweeps=3, num_importance=64
+    )
+    shapes, num_calls = [], 0
+
+    def is_mixed(draws):
+        shapes.append(draws.z.shape)
+        return len(shapes) > num_refusals
+
+    def evaluate(targets, structure, z):
+        nonlocal num_calls
+        num_calls += 1
+        return jnp.zeros(structure.shape, z.dtype)
+
+    found = sample_population(
+        jax.random.key(4),
+        targets,
+        stacked,
+        settings,
+        evaluate=evaluate,
+        is_mixed=is_mixed,
+    )
+    num_doublings = min(num_refusals, settings.max_doublings)
+    assert len(shapes) == num_doublings + 1
+    # However many sweeps are made, as many are kept.
+    assert set(shapes) == {(1, 2, 24, targets.slot.shape[1])}
+    num_sweeps = settings.num_warmup + settings.num_sweeps * 2**num_doublings
+    assert num_calls == 2 + 5 * num_sweeps
+    assert found.counts.proposed.sum() <= 5 * 16 * (num_sweeps - settings.num_warmup)
+    assert found.counts.proposed.sum() > 3 * 16 * (num_sweeps - settings.num_warmup)
