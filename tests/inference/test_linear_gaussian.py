@@ -170,6 +170,7 @@ def test_refined_weights_are_structure_probabilities():
     assert np.max(np.abs(scores)) < two_sided(FALSE_ALARM, scores.size)
 
 
+@pytest.mark.slow
 def test_objects_can_be_batched_and_compile_once():
     traces = []
 

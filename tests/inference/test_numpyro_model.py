@@ -267,6 +267,7 @@ def test_other_rows_are_predicted_from_their_own_states(spec):
     assert observed.shape == (1, 9, 1)
 
 
+@pytest.mark.slow
 def test_handlers_and_svi_work(spec):
     free = make_model(spec, pushed(spec))
     fixed = condition(free, {"table.density": 12.0})

@@ -156,6 +156,7 @@ def test_short_walks_about_the_posterior_are_nearly_always_accepted():
     assert np.asarray(info.accept_probability).mean() > 0.97
 
 
+@pytest.mark.slow
 def test_prior_only_run_returns_the_prior():
     """Structure frequencies and marginals, from a deliberately skewed mixture."""
     target = make_target(NoLikelihood(), ANGLES)
@@ -215,6 +216,7 @@ class TwoHeadings(eqx.Module):
         return jnp.where(active[0], bimodal, jnp.log(0.2))
 
 
+@pytest.mark.slow
 def test_bimodal_angle_is_shared_out_rightly():
     """Both lobes of a von Mises mixture, one of them across the period's seam."""
     target = StructureTarget(
@@ -257,6 +259,7 @@ def test_bimodal_angle_is_shared_out_rightly():
         assert abs(value.mean()) < two_sided(FALSE_ALARM, len(values)) * error
 
 
+@pytest.mark.slow
 def test_run_chains_makes_the_same_moves_as_single_steps():
     target, mixture, *_ = linear_case()
     settings = ChainSettings()

@@ -45,6 +45,7 @@ def run_mcmc(kernel, key, method, num_samples=30):
     return mcmc
 
 
+@pytest.mark.slow
 def test_numpyro_chains_agree_between_methods_and_print(kernel, capsys):
     key = jax.random.key(5)
     together = run_mcmc(kernel, key, "vectorized")

@@ -142,6 +142,7 @@ def worst_of_each(array, expected):
     return np.max(difference, axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("has_nuisances", [True, False], ids=["full", "plain"])
 def test_fast_path_agrees_with_the_general_one(has_nuisances):
     for spread in (1.0, 4.0):
@@ -160,6 +161,7 @@ def test_fast_path_agrees_with_the_general_one(has_nuisances):
                 assert np.quantile(difference, 0.9) < 2e-6
 
 
+@pytest.mark.slow
 def test_fast_path_agrees_with_itself_in_single_precision():
     double = np.asarray(fast_step(*draws()))
     single = jax.tree.map(
@@ -258,6 +260,7 @@ def backward(params, state, wrench, key):
     return sum(jnp.sum(a * b) for a, b in pairs)
 
 
+@pytest.mark.slow
 def test_derivatives_agree_between_modes_and_paths():
     cases = *draws(seed=2), jax.random.split(jax.random.key(3), NUM_CASES)
     rate = np.asarray(jax.jit(jax.vmap(forward))(*cases)).reshape(NUM_CASES, -1)
