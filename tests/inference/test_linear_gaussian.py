@@ -76,6 +76,7 @@ def test_chains_agree_with_closed_form(settings):
     assert np.sum(info.accepted[..., 1]) > 500
 
 
+@pytest.mark.slow
 def test_chains_agree_with_closed_form_in_either_precision(precision):
     target, design, data = make_problem(seed=3)
     _, probability, means, covariances = closed_form(design, data)

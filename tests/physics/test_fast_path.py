@@ -181,6 +181,7 @@ def test_fast_path_agrees_with_itself_in_single_precision():
     assert np.quantile(difference, 0.99) < 1e-2
 
 
+@pytest.mark.slow
 def test_friction_is_solved_to_the_end():
     cases = draws(seed=1)
     usual = np.asarray(fast_short_step(*cases))

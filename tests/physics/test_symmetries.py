@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from boomdp_jax.physics import State, rollout
 from tests.physics.scenes import make_params, make_scene, make_state, run, run_chunk
@@ -83,6 +84,7 @@ def test_turning_and_moving_the_world_turns_and_moves_the_motion():
     assert np.max(np.abs(moved - plain)) < 1e-8
 
 
+@pytest.mark.slow
 def test_relabelling_bodies_relabels_the_motion(precision):
     pins = [
         Pin(0, (0.28, 0.0), (-0.18, 0.05), b=1, viscous=0.1),
