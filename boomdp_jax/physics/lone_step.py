@@ -65,6 +65,8 @@ def lone_step(
         turned,
         None,
         length=num_substeps,
+        # Two at a time: a fifth less for a gradient, the same for a motion.
+        unroll=2,
     )
     return turned.motion
 
