@@ -32,6 +32,7 @@ from boomdp_jax.physics.implicit_fit import Groups
 from boomdp_jax.physics.joints import Slot
 from boomdp_jax.physics.lone_contacts import Feet, Pair, Track, into, turned
 from boomdp_jax.physics.lone_friction import Brake, Stuck
+from boomdp_jax.physics.lone_wheel import Grip, grip
 
 
 class Pivot(NamedTuple):
@@ -69,8 +70,9 @@ class LoneBody(NamedTuple):
     """Friction against spin, from the floor."""
     joint: Brake | None
     """Friction of the pin."""
-    stuck: Stuck | None
-    """None where at most one contact and no torque from the floor act."""
+    aid: Stuck | Grip | None
+    """What helps to solve for friction: the grip of the pin where at most one contact
+    and no torque from the floor act."""
     pivot: Pivot | None
 
 
@@ -145,9 +147,9 @@ def lone_body(
     brakes = [Brake(*spin) for spin in ([] if spins is None else _parts(spins))]
     tracks, feet, brakes = held((tracks, feet, brakes))
     floor = brakes[: len(brakes) - len(pins)]
-    stuck = None
+    aid = grip(brakes[-1]) if pins else None
     if len(parts) > 1 or floor:
-        stuck = held(jax.lax.stop_gradient(_stuck(tracks, feet, brakes, zero)))
+        aid = _stuck(tracks, feet, brakes, zero)
     return LoneBody(
         length=length,
         mobile=mobile,
@@ -160,7 +162,7 @@ def lone_body(
         feet=feet,
         brakes=floor,
         joint=brakes[-1] if pins else None,
-        stuck=stuck,
+        aid=held(jax.lax.stop_gradient(aid)),
         pivot=pivot,
     )
 

@@ -16,7 +16,6 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from boomdp_jax.core.arrays import FloatScalar
-from boomdp_jax.core.holding import hold
 from boomdp_jax.physics.friction import is_reversed
 
 Pair = tuple[FloatScalar, FloatScalar]
@@ -125,10 +124,9 @@ def feet_force(feet: Feet, motions: Motions) -> Triple:
     return x, y, moment
 
 
-def track_sums(track: Track, motions: Motions, one: FloatScalar) -> Sums:
+def track_sums(track: Track, motions: Motions) -> Sums:
     """Derivative and force of wheels, in the body's frame."""
     speeds, side = track_speeds(track, motions.end, motions.start)
-    speeds, side = [hold(speed, one) for speed in speeds], hold(side, one)
     (c, d), (k, m), (w, z) = track.viscous, track.knee, track.share
     old = None
     if motions.before is not None:
@@ -159,15 +157,14 @@ def track_sums(track: Track, motions: Motions, one: FloatScalar) -> Sums:
     sums = [_total(column) for column in zip(*parts, strict=True)]
     if track.heading is None:
         return tuple(sums)
-    sums = [hold(v, one) for v in sums]
     force = out_of(track.heading, sums[9], sums[10])
     return (*turned(track.heading, sums[:9]), *force, sums[11])
 
 
-def feet_sums(feet: Feet, motions: Motions, one: FloatScalar) -> Sums:
+def feet_sums(feet: Feet, motions: Motions) -> Sums:
     """Derivative and force of feet."""
     motion = feet_motion(feet, motions.end, motions.start)
-    ux, uy, spin = (hold(v, one) for v in motion)
+    ux, uy, spin = motion
     knee, share, old, parts = feet.knee, feet.share, None, []
     if motions.before is not None:
         old = feet_motion(feet, motions.before, motions.start)

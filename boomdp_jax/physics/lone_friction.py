@@ -22,7 +22,6 @@ import jax
 import jax.numpy as jnp
 
 from boomdp_jax.core.arrays import FloatScalar
-from boomdp_jax.core.holding import hold
 from boomdp_jax.physics.friction import NUM_NEWTON, is_reversed
 from boomdp_jax.physics.lone_contacts import (
     Feet,
@@ -39,8 +38,8 @@ from boomdp_jax.physics.lone_contacts import (
     track_force,
     track_sums,
 )
-from boomdp_jax.physics.lone_wheel import slipping_wheel
-from boomdp_jax.physics.small_linear import inverse3, matvec3, solve3
+from boomdp_jax.physics.lone_wheel import Grip, slipping_wheel
+from boomdp_jax.physics.small_linear import solve3
 
 
 class Brake(NamedTuple):
@@ -109,25 +108,22 @@ def _miss(problem: SlidingProblem, solution: Triple, impulse: Triple) -> Triple:
     return x - slide * impulse[0], y - slide * impulse[1], spin - turn * impulse[2]
 
 
-def _jacobian(problem: SlidingProblem, entries, one: FloatScalar) -> list:
+def _jacobian(problem: SlidingProblem, entries) -> list:
     """R + L A, rows of entries."""
     (cos, sin), slide, turn = problem.turn, problem.ease[0], 1.0 / problem.ease[1]
     xx, xy, xt, yx, yy, yt, tx, ty, tt = entries
-    rows = [
+    return [
         [cos + slide * xx, slide * xy - sin, slide * xt],
         [slide * yx + sin, cos + slide * yy, slide * yt],
         [turn * tx, turn * ty, 1.0 + turn * tt],
     ]
-    return [[hold(entry, one) for entry in row] for row in rows]
 
 
-def _linearise(
-    problem: SlidingProblem, e: Triple, before: Triple | None, one: FloatScalar
-):
+def _linearise(problem: SlidingProblem, e: Triple, before: Triple | None):
     """Residual and its derivative, rows of entries."""
     motions = Motions(e, problem.start, before)
-    parts = [track_sums(track, motions, one) for track in problem.tracks]
-    parts += [feet_sums(feet, motions, one) for feet in problem.feet]
+    parts = [track_sums(track, motions) for track in problem.tracks]
+    parts += [feet_sums(feet, motions) for feet in problem.feet]
     # Where nothing but spin is resisted.
     parts = parts or [(jnp.zeros_like(e[2]),) * 12]
     *entries, x, y, moment = (
@@ -147,10 +143,10 @@ def _linearise(
     push = problem.push
     impulse = (push[0] - x, push[1] - y, push[2] - moment)
     solution = (*out_of(problem.turn, e[0], e[1]), e[2])
-    return _miss(problem, solution, impulse), _jacobian(problem, entries, one)
+    return _miss(problem, solution, impulse), _jacobian(problem, entries)
 
 
-def _newton(problem: SlidingProblem, stuck: Stuck, one: FloatScalar) -> Triple:
+def _newton(problem: SlidingProblem, stuck: Stuck) -> Triple:
     """Several contacts: start from all of them sticking, then iterate."""
     xx, xy, xt, yy, yt, tt = stuck.start
     ux, uy, spin = problem.start
@@ -158,33 +154,32 @@ def _newton(problem: SlidingProblem, stuck: Stuck, one: FloatScalar) -> Triple:
     y = problem.push[1] - (xy * ux + yy * uy + yt * spin)
     moment = problem.push[2] - (xt * ux + yt * uy + tt * spin)
     slide, turn = problem.ease[0], 1.0 / problem.ease[1]
-    pushed = tuple(hold(v, one) for v in (slide * x, slide * y, turn * moment))
+    pushed = (slide * x, slide * y, turn * moment)
     xx, xy, xt, yy, yt, tt = stuck.end
-    jacobian = _jacobian(problem, (xx, xy, xt, xy, yy, yt, xt, yt, tt), one)
+    jacobian = _jacobian(problem, (xx, xy, xt, xy, yy, yt, xt, yt, tt))
     e = solve3(jacobian, pushed)
-    return jax.lax.fori_loop(
-        0, NUM_NEWTON, lambda _, pair: _newton_step(problem, *pair, one), (e, e)
-    )[0]
+    before = e
+    for _ in range(NUM_NEWTON):
+        e, before = _newton_step(problem, e, before)
+    return e
 
 
 def _newton_step(
-    problem: SlidingProblem, e: Triple, before: Triple, one: FloatScalar
+    problem: SlidingProblem, e: Triple, before: Triple
 ) -> tuple[Triple, Triple]:
-    miss, jacobian = _linearise(problem, e, before, one)
-    miss = tuple(hold(r, one) for r in miss)
+    miss, jacobian = _linearise(problem, e, before)
     change = solve3(jacobian, miss)
     return tuple(a - b for a, b in zip(e, change, strict=True)), e
 
 
-def solve_sliding(
-    problem: SlidingProblem, stuck: Stuck | None, one: FloatScalar
-) -> Triple:
+def solve_sliding(problem: SlidingProblem, aid: Stuck | Grip | None) -> Triple:
     """Velocity of the anchor and spin at the end of a step.
 
     Args:
         problem: momenta and frictions.
-        stuck: the same friction without limits; None for a single contact, or none.
-        one: from `runtime_one`.
+        aid: the same friction without limits; of a single contact or none, the grip of
+            the pin's friction, if there is a pin. Not differentiated: it says nothing
+            that the problem does not.
 
     Returns:
         The anchor's velocity [m/s], in the frame at mid-step, and the spin [rad/s].
@@ -192,15 +187,15 @@ def solve_sliding(
     """
 
     @jax.custom_jvp
-    def solve(problem, stuck, one):
-        if stuck is None:
-            return slipping_wheel(problem, one)
-        x, y, spin = _newton(problem, stuck, one)
+    def solve(problem, aid):
+        if not isinstance(aid, Stuck):
+            return slipping_wheel(problem, aid)
+        x, y, spin = _newton(problem, aid)
         return *out_of(problem.turn, x, y), spin
 
     def solve_jvp(primals, tangents):
-        (problem, stuck, one), (rate, _, _) = primals, tangents
-        solution = solve(problem, stuck, one)
+        (problem, aid), (rate, _) = primals, tangents
+        solution = solve(problem, aid)
         leaves, treedef = jax.tree.flatten(problem)
         rates = jax.tree.leaves(
             rate, is_leaf=lambda x: isinstance(x, jax.custom_derivatives.SymbolicZero)
@@ -221,11 +216,9 @@ def solve_sliding(
             miss, ([leaves[i] for i in moving],), ([rates[i] for i in moving],)
         )
         e = (*into(problem.turn, *solution[:2]), solution[2])
-        _, jacobian = _linearise(problem, e, None, one)
-        inverse = [[hold(entry, one) for entry in row] for row in inverse3(jacobian)]
-        rate = tuple(-hold(r, one) for r in rate)
-        x, y, spin = (hold(v, one) for v in matvec3(inverse, rate))
+        _, jacobian = _linearise(problem, e, None)
+        x, y, spin = (-value for value in solve3(jacobian, rate))
         return solution, (*out_of(problem.turn, x, y), spin)
 
     solve.defjvp(solve_jvp, symbolic_zeros=True)
-    return solve(problem, stuck, one)
+    return solve(problem, aid)

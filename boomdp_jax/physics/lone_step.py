@@ -16,13 +16,17 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from boomdp_jax.core.arrays import FloatScalar
-from boomdp_jax.core.holding import hold, runtime_one
+from boomdp_jax.core.arrays import BoolScalar, FloatScalar
+from boomdp_jax.core.one_loop import one_loop
 from boomdp_jax.physics.lone_body import LoneBody, Pivot
 from boomdp_jax.physics.lone_contacts import Pair, into, out_of
-from boomdp_jax.physics.lone_friction import SlidingProblem, solve_sliding
+from boomdp_jax.physics.lone_friction import SlidingProblem, Stuck, solve_sliding
 from boomdp_jax.physics.motion import Motion
 from boomdp_jax.physics.trigonometry import heading_turn, rotated
+
+# Substeps that are written out in one loop; more are compiled as a loop of such loops.
+# With so many the reverse pass is one loop too (`core.scalar_parts`), or takes few.
+_MOST_IN_A_LOOP, _MOST_OF_SEVERAL_CONTACTS = 2, 1
 
 
 class _Turned(NamedTuple):
@@ -34,7 +38,7 @@ class _Turned(NamedTuple):
 
 def lone_step(
     body: LoneBody, motion: Motion, force: tuple, num_substeps: int
-) -> Motion:
+) -> tuple[Motion, FloatScalar, BoolScalar]:
     """Advance by one step.
 
     Args:
@@ -44,39 +48,78 @@ def lone_step(
         num_substeps: how many the step is made of.
 
     Returns:
-        The motion after the step.
+        The motion after the step, the distance by which the pin fails to hold then
+        [m], and whether everything is finite.
     """
-    h, mobile, one = body.length, body.mobile, runtime_one(body.mass)
-    impulse = (
-        hold(mobile * (h * force[0] + body.weight[0]), one),
-        hold(mobile * (h * force[1] + body.weight[1]), one),
-        hold(mobile * h * force[2], one),
+    has_several = isinstance(body.aid, Stuck)
+    most = _MOST_OF_SEVERAL_CONTACTS if has_several else _MOST_IN_A_LOOP
+    if num_substeps <= most:
+        motion, error, count = one_loop(
+            _whole_step, body, motion, force, static=(num_substeps,)
+        )
+        return motion, error, count > 0
+    turned = one_loop(_begun, body, motion)
+    blocks, rest = divmod(num_substeps, most)
+    turned, _ = jax.lax.scan(
+        lambda now, _: (one_loop(_advanced, body, now, force, static=(most,)), None),
+        turned,
+        None,
+        length=blocks,
     )
+    if rest:
+        turned = one_loop(_advanced, body, turned, force, static=(rest,))
+    error, count = one_loop(_reported, body, turned)
+    return turned.motion, error, count > 0
+
+
+def _whole_step(num_substeps: int, body: LoneBody, motion: Motion, force: tuple):
+    turned = _advanced(num_substeps, body, _begun(body, motion), force)
+    return turned.motion, *_reported(body, turned)
+
+
+def _begun(body: LoneBody, motion: Motion) -> _Turned:
+    """Static bodies rest, and a pinned one hangs on its pin."""
+    mobile = body.mobile
     motion = motion._replace(
         vx=mobile * motion.vx, vy=mobile * motion.vy, spin=mobile * motion.spin
     )
     turned = _Turned(motion, heading_turn(motion.theta + body.facing))
-    if body.pivot is not None:
-        turned = _levelled(body.pivot, turned, one)
-    if num_substeps == 1:
-        return _substep(body, turned, impulse).motion
-    turned, _ = jax.lax.scan(
-        lambda now, _: (_substep(body, now, impulse), None),
-        turned,
-        None,
-        length=num_substeps,
-        # Two at a time: a fifth less for a gradient, the same for a motion.
-        unroll=2,
+    return turned if body.pivot is None else _levelled(body.pivot, turned)
+
+
+def _advanced(
+    num_substeps: int, body: LoneBody, turned: _Turned, force: tuple
+) -> _Turned:
+    h, mobile = body.length, body.mobile
+    impulse = (
+        mobile * (h * force[0] + body.weight[0]),
+        mobile * (h * force[1] + body.weight[1]),
+        mobile * h * force[2],
     )
-    return turned.motion
+    for _ in range(num_substeps):
+        turned = _substep(body, turned, impulse)
+    return turned
 
 
-def _levelled(pivot: Pivot, turned: _Turned, one: FloatScalar) -> _Turned:
+def _reported(body: LoneBody, turned: _Turned) -> tuple[FloatScalar, FloatScalar]:
+    """Joint drift [m], and one if all is finite, else zero."""
+    motion, turn = turned
+    error = jnp.zeros_like(motion.x)
+    if body.pivot is not None:
+        x, y = _offset(body.pivot, motion, turn)
+        square = x * x + y * y
+        has_error = square > 0
+        error = jnp.where(has_error, jnp.sqrt(jnp.where(has_error, square, 1.0)), 0.0)
+    total = sum(motion[1:], start=motion[0])
+    return error, jnp.isfinite(total).astype(total.dtype)
+
+
+def _levelled(pivot: Pivot, turned: _Turned) -> _Turned:
     """Bring a pose onto the pin by the smallest change in the sense of its mass."""
     motion, turn = turned
     x, y = pivot.anchor
     off_x, off_y = _offset(pivot, motion, turn)
-    angle = hold(pivot.levelling * (y * off_x - x * off_y), one)
+    angle = pivot.levelling * (y * off_x - x * off_y)
     # Where it is follows from the heading.
     return _Turned(motion._replace(theta=motion.theta + angle), rotated(turn, angle))
 
@@ -88,13 +131,13 @@ def _offset(pivot: Pivot, motion: Motion, turn: Pair) -> Pair:
 
 
 def _substep(body: LoneBody, turned: _Turned, impulse: tuple) -> _Turned:
-    h, one = body.length, runtime_one(body.mass)
+    h = body.length
     motion, start = turned
     vx, vy, spin = motion[3:]
     half = rotated(None, 0.5 * h * spin)
     middle = out_of(start, *half)
     px, py = body.mass * vx + impulse[0], body.mass * vy + impulse[1]
-    push_x, push_y = (hold(v, one) for v in into(middle, px, py))
+    push_x, push_y = into(middle, px, py)
     moment = body.inertia * spin + impulse[2]
     slide_x, slide_y = into(start, vx, vy)
     inertia = body.inertia
@@ -113,7 +156,7 @@ def _substep(body: LoneBody, turned: _Turned, impulse: tuple) -> _Turned:
         brakes=body.brakes,
         joint=body.joint,
     )
-    slide_x, slide_y, new_spin = solve_sliding(problem, body.stuck, one)
+    slide_x, slide_y, new_spin = solve_sliding(problem, body.aid)
     new_vx, new_vy = out_of(middle, slide_x, slide_y)
     angle = 0.5 * h * (spin + new_spin)
     end = rotated(start, angle)
@@ -127,13 +170,3 @@ def _substep(body: LoneBody, turned: _Turned, impulse: tuple) -> _Turned:
         new_y = pivot.free * new_y + pivot.place[1] - arm_y
     moved = Motion(new_x, new_y, motion.theta + angle, new_vx, new_vy, new_spin)
     return _Turned(moved, end)
-
-
-def lone_error(body: LoneBody, motion: Motion) -> FloatScalar:
-    """Squared distance by which the pin fails to hold [m²]; zero without one."""
-    if body.pivot is None:
-        return jnp.zeros_like(motion.x)
-    one = runtime_one(body.mass)
-    turn = heading_turn(motion.theta + body.facing)
-    x, y = (hold(v, one) for v in _offset(body.pivot, motion, turn))
-    return x * x + y * y

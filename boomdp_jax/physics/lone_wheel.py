@@ -11,18 +11,18 @@ $$\bar u = s\,\frac{s\,b + c}{Q(s)}, \qquad c = adj(H)\,b, \qquad
 and a contact slips at the s > 1, if there is one, at which $|D^{-1} C \bar u| = s$,
 that is $|D^{-1} C (s\,b + c)| = Q(s)$: the secular equation of trust-region methods
 (Moré and Sorensen 1983, SIAM J. Sci. Stat. Comput. 4, 553), a norm against a parabola.
-Everything before s is one chain of arithmetic without branches, which a compiler fuses
-into one loop; that is what this form is for.
+All of it is one chain of arithmetic without branches, as `core.one_loop` takes it.
 
 The brake (a pin's friction) slips at a constant torque, so it only has to be known
 whether, and which way; the signs of the balance at the two spins where it starts to
 slip tell. It may act only where the pin holds.
 """
 
+from typing import Any, NamedTuple
+
 import jax.numpy as jnp
 
 from boomdp_jax.core.arrays import FloatScalar
-from boomdp_jax.core.holding import hold
 from boomdp_jax.physics.lone_contacts import Pair, Track, Triple, blend
 
 # Halley steps for s, from an upper bound that is exact where the two vectors are
@@ -32,66 +32,90 @@ from boomdp_jax.physics.lone_contacts import Pair, Track, Triple, blend
 _NUM_HALLEY = 2
 # Below this a squared speed counts as zero.
 _TINY = 1e-30
+# Limit of what has none.
+_ENDLESS = 1e30
 
 
-def slipping_wheel(problem, one: FloatScalar) -> Triple:
+class Grip(NamedTuple):
+    """A brake that holds or slips, in numbers that do not change from step to step."""
+
+    limit: FloatScalar
+    """Impulse at which it slips [N m s]."""
+    turned: FloatScalar
+    """Spin at the end at which it does, of a body at rest [rad/s]."""
+    coasting: FloatScalar
+    """How much less of that there is for each unit of spin at the start."""
+    held: Pair
+    """Impulse per spin at the end and at the start while it holds [N m s²]."""
+
+
+def grip(brake: Any) -> Grip:
+    """Those numbers of a `lone_friction.Brake`."""
+    is_limited = brake.knee > 0
+    edge = 1.0 / jnp.where(is_limited, brake.knee, 1.0)
+    return Grip(
+        limit=jnp.where(is_limited, brake.viscous * edge, _ENDLESS),
+        turned=edge / brake.share,
+        coasting=(1.0 - brake.share) / brake.share,
+        held=(brake.viscous * brake.share, brake.viscous * (1.0 - brake.share)),
+    )
+
+
+def slipping_wheel(problem: Any, brake: Grip | None) -> Triple:
     """Velocity of the anchor and spin at the end of a step.
 
     Args:
-        problem: of `lone_friction`, with at most one contact and one brake (zero unless
-            the body is pinned).
-        one: from `runtime_one`.
+        problem: of `lone_friction`, with at most one contact.
+        brake: of its pin (zero unless the body is pinned), if it has one.
 
     Returns:
         Anchor velocity [m/s], in the frame at mid-step, and spin [rad/s].
     """
     light, inertia = problem.ease
     x, y, turning = problem.push
-    track = problem.tracks[0] if problem.tracks else None
-    if track is None:
-        if problem.joint is not None:
-            inertia, turning = _held(problem, None, None, one)
-        return light * x, light * y, turning / inertia
     slide_x, slide_y, spin = problem.start
-    begin = (slide_x + track.reach[0] * spin, slide_y + track.lead * spin)
-    if problem.joint is not None:
-        inertia, turning = _held(problem, track, begin, one)
-    first, second = _forces(problem, track, begin, (1.0 / inertia, turning), one)
+    track = problem.tracks[0] if problem.tracks else None
+    begin = None
+    if track is not None:
+        begin = (slide_x + track.reach[0] * spin, slide_y + track.lead * spin)
+    if brake is not None:
+        inertia, turning = _held(brake, (inertia, turning), spin, track, begin)
+    swing = 1.0 / inertia
+    if track is None or begin is None:
+        return light * x, light * y, turning * swing
+    first, second = _forces(problem, track, begin, (swing, turning))
     turning = turning - track.reach[0] * first - track.lead * second
-    return light * (x - first), light * (y - second), turning / inertia
+    return light * (x - first), light * (y - second), turning * swing
 
 
 def _held(
-    problem, track: Track | None, begin: Pair | None, one: FloatScalar
+    brake: Grip, rotor: Pair, spin: FloatScalar, track: Track | None, begin: Pair | None
 ) -> tuple[FloatScalar, FloatScalar]:
     """Take the brake into inertia and push, in whichever of its regimes it is."""
-    brake, inertia, turning = problem.joint, problem.ease[1], problem.push[2]
-    spin = problem.start[2]
-    is_limited = brake.knee > 0
-    edge = 1.0 / jnp.where(is_limited, brake.knee, 1.0)
-    limit = brake.viscous * edge
-    # The spin at the end for which the brake sees its edge, either way.
-    coasting, turned = (1.0 - brake.share) / brake.share, edge / brake.share
-
-    def excess(way: float):
-        """Sign of the balance at that spin, with the brake at its limit."""
-        ending = way * turned - coasting * spin
-        missing = ending * inertia - turning + way * limit
-        if track is None or begin is None:
-            return missing
+    inertia, turning = rotor
+    # The balance at the two spins at the end at which the brake slips, with the brake
+    # at its limit: the mean of both, and what one has more than it.
+    coasted = brake.coasting * spin
+    more, mean = brake.turned * inertia + brake.limit, -coasted * inertia - turning
+    ahead, behind = mean + more, mean - more
+    if track is not None and begin is not None:
         # Where the pin holds its anchor does not slide.
-        u, v = _speeds(track, (track.reach[0] * ending, track.lead * ending), begin)
+        (p, q), (w, z) = (track.reach[0], track.lead), track.share
         (c, d), (k, m) = track.viscous, track.knee
-        square = jnp.maximum((k * u) ** 2 + (m * v) ** 2, 1.0)
-        lever = track.reach[0] * (c * u) + track.lead * (d * v)
-        return missing * jnp.sqrt(square) + lever
+        mores = (w * p * brake.turned, z * q * brake.turned)
+        means = _speeds(track, (-p * coasted, -q * coasted), begin)
 
-    is_ahead = is_limited & (excess(1.0) < 0)
-    is_behind = is_limited & (excess(-1.0) > 0)
-    way = hold(jnp.where(is_ahead, 1.0, jnp.where(is_behind, -1.0, 0.0)), one)
-    viscous = (1.0 - way * way) * brake.viscous
-    turning = turning - way * limit - viscous * (1.0 - brake.share) * spin
-    return inertia + viscous * brake.share, hold(turning, one)
+        def balance(missing, speeds):
+            u, v = speeds
+            square = jnp.maximum((k * u) ** 2 + (m * v) ** 2, 1.0)
+            return missing * jnp.sqrt(square) + p * c * u + q * d * v
+
+        ahead = balance(ahead, (means[0] + mores[0], means[1] + mores[1]))
+        behind = balance(behind, (means[0] - mores[0], means[1] - mores[1]))
+    way = jnp.where(ahead < 0, 1.0, jnp.where(behind > 0, -1.0, 0.0))
+    holds = 1.0 - way * way
+    turning = turning - way * brake.limit - holds * brake.held[1] * spin
+    return inertia + holds * brake.held[0], turning
 
 
 def _speeds(track: Track, end: Pair, begin: Pair) -> Pair:
@@ -100,7 +124,7 @@ def _speeds(track: Track, end: Pair, begin: Pair) -> Pair:
     return blend(w, end[0], begin[0]), blend(z, end[1], begin[1])
 
 
-def _forces(problem, track: Track, begin: Pair, rotor: Pair, one: FloatScalar):
+def _forces(problem, track: Track, begin: Pair, rotor: Pair):
     """Impulses of the contact along its two directions."""
     light, (swing, turning), (cos, sin) = problem.ease[0], rotor, problem.turn
     (c, d), knee, (w, z) = track.viscous, track.knee, track.share
@@ -111,7 +135,7 @@ def _forces(problem, track: Track, begin: Pair, rotor: Pair, one: FloatScalar):
         light * (cos * x + sin * y) + p * free,
         light * (cos * y - sin * x) + q * free,
     )
-    b = tuple(hold(v, one) for v in _speeds(track, end, begin))
+    b = _speeds(track, end, begin)
     # H = Theta (l R^T + g a a^T) C, with a the arms.
     straight, twist, cross = light * cos, light * sin, swing * p * q
     h = [
@@ -135,11 +159,9 @@ def _forces(problem, track: Track, begin: Pair, rotor: Pair, one: FloatScalar):
         determinant,
         small,
     )
-    s = hold(s, one)
-    quadratic = s * (s + trace) + determinant
+    scale = small / (s * (s + trace) + determinant)
     return tuple(
-        v * (s * x + y) * small / quadratic
-        for v, x, y in zip(track.viscous, b, slow, strict=True)
+        v * (s * x + y) * scale for v, x, y in zip(track.viscous, b, slow, strict=True)
     )
 
 

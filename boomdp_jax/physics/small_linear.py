@@ -82,7 +82,7 @@ def solve_rows(s, rhs):
 
 
 def solve3(a, b):
-    """Solve a 3 x 3 system by Cramer's rule, each number ending in one division.
+    """Solve a 3 x 3 system by Cramer's rule.
 
     Args:
         a: rows of entries, each entry an array of one shape.
@@ -92,17 +92,13 @@ def solve3(a, b):
         The solution, three arrays.
     """
     (a00, a01, a02), (a10, a11, a12), (a20, a21, a22) = a
-    c00, c01, c02 = (
-        a11 * a22 - a12 * a21,
-        a12 * a20 - a10 * a22,
-        a10 * a21 - a11 * a20,
+    c00 = a11 * a22 - a12 * a21
+    c01 = a12 * a20 - a10 * a22
+    c02 = a10 * a21 - a11 * a20
+    scale = 1.0 / (a00 * c00 + a01 * c01 + a02 * c02)
+    adjugate = (
+        (c00, a02 * a21 - a01 * a22, a01 * a12 - a02 * a11),
+        (c01, a00 * a22 - a02 * a20, a02 * a10 - a00 * a12),
+        (c02, a01 * a20 - a00 * a21, a00 * a11 - a01 * a10),
     )
-    determinant = a00 * c00 + a01 * c01 + a02 * c02
-    return (
-        (c00 * b[0] + (a02 * a21 - a01 * a22) * b[1] + (a01 * a12 - a02 * a11) * b[2])
-        / determinant,
-        (c01 * b[0] + (a00 * a22 - a02 * a20) * b[1] + (a02 * a10 - a00 * a12) * b[2])
-        / determinant,
-        (c02 * b[0] + (a01 * a20 - a00 * a21) * b[1] + (a00 * a11 - a01 * a10) * b[2])
-        / determinant,
-    )
+    return tuple(scale * value for value in matvec3(adjugate, b))

@@ -31,7 +31,7 @@ from boomdp_jax.physics.joints import (
     joint_rows,
 )
 from boomdp_jax.physics.lone_body import LoneBody
-from boomdp_jax.physics.lone_step import lone_error, lone_step
+from boomdp_jax.physics.lone_step import lone_step
 from boomdp_jax.physics.motion import Motion, motion_of, scalars, state_of
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.prepare import Prepared, prepare
@@ -78,8 +78,8 @@ def step(
     del cache  # No solver of this engine needs one without contact.
     length = jnp.asarray(scene.dt if dt is None else dt, state.pose.dtype)
     prepared = prepare(scene, params, length)
-    motion = _step(scene, prepared, motion_of(state), wrench)
-    return state_of(motion, scene.num_bodies), _info(prepared, motion)
+    motion, info = _step(scene, prepared, motion_of(state), wrench)
+    return state_of(motion, scene.num_bodies), info
 
 
 def prepare_step(
@@ -103,8 +103,8 @@ def prepare_step(
     prepared = prepare(scene, params, length)
 
     def advance(state: State, wrench: Float[Array, "body 3"]) -> tuple[State, StepInfo]:
-        motion = _step(scene, prepared, motion_of(state), wrench)
-        return state_of(motion, scene.num_bodies), _info(prepared, motion)
+        motion, info = _step(scene, prepared, motion_of(state), wrench)
+        return state_of(motion, scene.num_bodies), info
 
     return advance
 
@@ -118,9 +118,6 @@ def rollout(
     dt: Float[Array, " time"] | Float[Array, ""] | float | None = None,
 ) -> tuple[State, StepInfo]:
     """Advance a world by many steps in one compiled loop.
-
-    Under `vmap` on a CPU a batch of a multiple of 1,024 (float32) is up to a quarter
-    slower than one of a few more or less: its arrays compete for the same cache lines.
 
     Args:
         scene: outlines, feet, gravity.
@@ -138,34 +135,38 @@ def rollout(
     def advance(motion, inputs):
         wrench, step_length = inputs
         prepared = prepare(scene, params, step_length) if constant is None else constant
-        motion = _step(scene, prepared, motion, wrench)
-        return motion, (motion, _info(prepared, motion))
+        motion, info = _step(scene, prepared, motion, wrench)
+        return motion, (state_of(motion, scene.num_bodies), info)
 
     inputs = (wrenches, length if constant is None else None)
     # A reverse pass takes every step again from the state before it: cheaper than to
-    # store the hundred numbers of each substep, and long rollouts fit into memory.
-    _, (motions, infos) = jax.lax.scan(
-        jax.checkpoint(advance, prevent_cse=False), motion_of(state), inputs
-    )
-    return state_of(motions, scene.num_bodies), infos
+    # store the hundred numbers of each substep, and long rollouts fit into memory. A
+    # lone body's does so of itself (`core.one_loop`).
+    is_lone = isinstance(constant, LoneBody)
+    one_step = advance if is_lone else jax.checkpoint(advance, prevent_cse=False)
+    return jax.lax.scan(one_step, motion_of(state), inputs)[1]
 
 
 def _step(
     scene: Scene, prepared: Prepared | LoneBody, motion: Motion, wrench
-) -> Motion:
+) -> tuple[Motion, StepInfo]:
     """All substeps of one step."""
     force = scalars(wrench)
     if isinstance(prepared, LoneBody):
-        return lone_step(prepared, motion, force, scene.num_substeps)
+        motion, error, is_finite = lone_step(
+            prepared, motion, force, scene.num_substeps
+        )
+        return motion, StepInfo(constraint_error=error, is_finite=is_finite)
     if scene.num_substeps == 1:
-        return _substep(prepared, motion, force)
+        motion = _substep(prepared, motion, force)
+        return motion, _info(prepared, motion)
     motion, _ = jax.lax.scan(
         lambda m, _: (_substep(prepared, m, force), None),
         motion,
         None,
         length=scene.num_substeps,
     )
-    return motion
+    return motion, _info(prepared, motion)
 
 
 def _substep(prepared: Prepared, motion: Motion, force) -> Motion:
@@ -231,12 +232,10 @@ def _substep(prepared: Prepared, motion: Motion, force) -> Motion:
     return project(prepared, moved)
 
 
-def _info(prepared: Prepared | LoneBody, motion: Motion) -> StepInfo:
+def _info(prepared: Prepared, motion: Motion) -> StepInfo:
     """Joint drift and finiteness of a motion."""
     square = jnp.zeros((), motion.x.dtype)
-    if isinstance(prepared, LoneBody):
-        square = lone_error(prepared, motion)
-    elif prepared.slots:
+    if prepared.slots:
         sin, cos = sincos(motion.theta)
         frames = Frames(motion.x, motion.y, cos, sin)
         for slot in prepared.slots:

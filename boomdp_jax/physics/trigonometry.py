@@ -117,8 +117,10 @@ def rotated(
 
 def _from_tangent(n, d, start=None):
     """Cosine and sine of an angle from its half's tangent n / d."""
-    cos, sin, total = d * d - n * n, 2.0 * d * n, d * d + n * n
-    if start is not None:
-        cos, sin = start[0] * cos - start[1] * sin, start[1] * cos + start[0] * sin
-    # Both divided, not multiplied by one inverse: see `core.holding`.
-    return cos / total, sin / total
+    # As corrections of where it starts, so that no turn is exactly none, and turns that
+    # are always rounded one way do not add up.
+    share = 2.0 * n / (d * d + n * n)
+    if start is None:
+        return 1.0 - share * n, share * d
+    cos, sin = start
+    return cos - share * (n * cos + d * sin), sin + share * (d * cos - n * sin)
