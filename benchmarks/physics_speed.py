@@ -1,8 +1,9 @@
 """How many body-steps a second the engine takes, and what a gradient costs.
 
 One body with a pin and a wheel, every hypothesis different, in single precision,
-through the public `rollout` on a scene read by `load_scene`. All outputs, reports
-included, enter a checksum inside the compiled call, so that nothing is optimised away.
+through the public `rollout` on a scene read by `load_scene`. The compiled call returns
+every state and report, so that nothing is optimised away; a gradient is that of the sum
+of their means, and is compared with a forward run that ends in the same sum.
 The answer is checked first: the worst of many hypotheses against its own differential
 equation, integrated by SciPy. Compile and run time are reported apart; a run is the
 fastest of several, with the median and the slowest beside it.
@@ -202,10 +203,15 @@ def check(reporter: Reporter, scene, params: Params, num_cases: int) -> bool:
     return is_right
 
 
+def forward(scene, params, state, wrenches):
+    """Every output of every hypothesis."""
+    return jax.vmap(lambda p, s, w: rollout(scene, p, s, w))(params, state, wrenches)
+
+
 def checksum(scene, params, state, wrenches):
-    """Every output of every hypothesis in one number."""
-    outputs = jax.vmap(lambda p, s, w: rollout(scene, p, s, w))(params, state, wrenches)
-    return sum(jnp.mean(leaf.astype(jnp.float32)) for leaf in jax.tree.leaves(outputs))
+    """The same in one number."""
+    outputs = jax.tree.leaves(forward(scene, params, state, wrenches))
+    return sum(jnp.mean(leaf.astype(jnp.float32)) for leaf in outputs)
 
 
 def measure(function, arguments, num_runs: int) -> tuple[float, list[float]]:
@@ -262,7 +268,7 @@ def time_forward(reporter, scene, params, batches, num_runs) -> None:
     for batch in batches:
         keys = jax.random.split(jax.random.key(0), batch)
         arguments = jax.jit(jax.vmap(draw, in_axes=(0, None)))(keys, params)
-        compile_seconds, runs = measure(checksum, (scene, *arguments), num_runs)
+        compile_seconds, runs = measure(forward, (scene, *arguments), num_runs)
         case = f"pin and wheel, float32, batch {batch}"
         work = batch * NUM_STEPS
         is_asked = batch == TARGET_BATCH
@@ -297,16 +303,16 @@ def time_gradient(reporter, scene, params, batches, num_runs) -> None:
             return checksum(scene, jax.tree.unflatten(treedef, full), state, wrenches)
 
         arguments = (scene, moving, state, wrenches)
-        _, forward = measure(loss, arguments, num_runs)
+        _, ahead = measure(loss, arguments, num_runs)
         compile_seconds, backward = measure(
             jax.value_and_grad(loss, argnums=(1, 2, 3)), arguments, num_runs
         )
         case = f"pin and wheel, float32, batch {batch}, 100 steps"
-        ratio = statistics.median(backward) / statistics.median(forward)
+        ratio = statistics.median(backward) / statistics.median(ahead)
         reporter.report(
             case=case,
             metric="value and gradient over value, fastest runs",
-            value=min(backward) / min(forward),
+            value=min(backward) / min(ahead),
             unit="times",
             n=num_runs,
             spread=[ratio],

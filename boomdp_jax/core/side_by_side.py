@@ -50,7 +50,7 @@ def call_each(
         The results, in order.
     """
     leaves, treedef = jax.tree.flatten(like)
-    shapes = tuple((jnp.shape(leaf), str(jnp.result_type(leaf))) for leaf in leaves)
+    shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
     # Whether floats are double is a setting of the thread.
     is_double = jnp.zeros(()).dtype == jnp.float64
     key = (function, treedef, shapes, is_double)

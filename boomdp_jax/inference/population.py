@@ -11,6 +11,7 @@ Prefer this to `structure_chain.run_chains` where a likelihood is far cheaper in
 than alone.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -255,7 +256,7 @@ class _Batch(NamedTuple):
     log_proposal: Float[Array, "object walker"]
 
 
-@QuickCompile
+@functools.partial(QuickCompile, static=("move",))
 def _propose(
     move: str,
     noise: Noise,
