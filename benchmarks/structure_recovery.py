@@ -47,6 +47,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="one cell, 3 objects")
     parser.add_argument("--objects", type=int, default=240, help="in the main cell")
     parser.add_argument("--main-only", action="store_true", help="no other cell")
+    parser.add_argument("--families", nargs="+", choices=FAMILIES, default=FAMILIES)
     parser.add_argument("--batch", type=int, default=24, help="objects in one call")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", help="file for the JSON lines")
@@ -57,21 +58,22 @@ def main() -> None:
         run_cell(reporter, "quick", objects, 1.0, True, arguments)
         reporter.print_table()
         return
-    num_small = max(len(FAMILIES), arguments.objects // 10)
+    families = arguments.families
+    num_small = max(len(families), arguments.objects // 10)
     objects = {
-        rows: make_objects(FAMILIES, num_small, rows, arguments.seed)
+        rows: make_objects(families, num_small, rows, arguments.seed)
         for rows in NUM_ROWS
     }
     report_single(reporter, objects[MAIN_ROWS], arguments.seed)
     main_objects = make_objects(
-        FAMILIES, arguments.objects, MAIN_ROWS, arguments.seed + 1
+        families, arguments.objects, MAIN_ROWS, arguments.seed + 1
     )
     run_cell(reporter, "main", main_objects, 1.0, True, arguments)
     if arguments.main_only:
         reporter.print_table()
         return
     other = make_objects(
-        FAMILIES, num_small, MAIN_ROWS, arguments.seed + 2, laws=SECOND_WORLD
+        families, num_small, MAIN_ROWS, arguments.seed + 2, laws=SECOND_WORLD
     )
     run_cell(reporter, "second world", other, 1.0, True, arguments)
     for rows, level, chained in itertools.product(
