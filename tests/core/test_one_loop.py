@@ -105,6 +105,7 @@ def test_forward_mode(batched, numbers, close):
     close(one(*numbers), other(*numbers))
 
 
+@pytest.mark.slow
 def test_second_derivatives(batched, numbers, close):
     one, other = (jax.jit(jax.hessian(total(batched(f)))) for f in (looped, chain))
     close(one(*numbers), other(*numbers))
