@@ -16,8 +16,8 @@ _MOST_WHOLE = 2100
 XLA's CPU backend writes a loop body of at most 2000 operations, of which it counts a
 few fewer than there are here, as one function. Of what is used on both sides of that
 border it makes functions that it computes again for every use: 9000 operations then
-take a minute to compile instead of three seconds, and each takes two hundred times
-longer to run. A hundred too many do no harm, while a border of our own, where some
+take forty seconds to compile instead of two, and each takes two hundred times longer
+to run. A hundred too many do no harm, while a border of our own, where some
 hundred values are alive, made a reverse pass five times slower."""
 _MOST_OPERATIONS = 1200
 """Aimed at in each part of a longer one."""
@@ -68,13 +68,14 @@ def parts_of(
     parts = []
     for first, last in itertools.pairwise(cuts):
         inside = equations[first:last]
-        made = [var for eqn in inside for var in eqn.outvars]
+        # Ordered, as a dictionary is.
+        made = dict.fromkeys(var for eqn in inside for var in eqn.outvars)
         used = [var for eqn in inside for var in _variables(eqn.invars)]
         results = [var for var in made if last_use.get(var, -1) >= last]
         if last == len(equations):
             results = list(flat.outvars)
             used += _variables(results)
-        taken = [var for var in dict.fromkeys(used) if var not in set(made)]
+        taken = [var for var in dict.fromkeys(used) if var not in made]
         # Where nothing is taken any value will do, to tell the type.
         inputs = tuple(numbers[var] for var in taken) or (0,)
         parts.append(Part(_function(inside, taken, results), inputs, len(results)))
