@@ -57,6 +57,7 @@ def _make_parser() -> argparse.ArgumentParser:
     _add_infer(commands.add_parser("infer", help="from recordings to a posterior"))
     _add_predict(commands.add_parser("predict", help="held-out error and coverage"))
     _add_simulate(commands.add_parser("simulate", help="from wrenches to a recording"))
+    _add_view(commands.add_parser("view", help="from a recording to a moving picture"))
     return parser
 
 
@@ -99,6 +100,24 @@ def _add_simulate(parser: argparse.ArgumentParser) -> None:
         help="standard deviation of readings [m, rad, m/s, rad/s]",
     )
     add("--seed", type=_whole(0, 2**32 - 1), default=0)
+
+
+def _add_view(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add(
+        "data",
+        metavar="DATA.npz|DIR",
+        help="planar-transitions-1, or a folder with scene.json and such files",
+    )
+    add("--scene", metavar="SCENE.json", help="outlines; required of a data file")
+    add(
+        "--out",
+        required=True,
+        metavar="FILE.gif|.html",
+        help="of several data files, FILE-0.gif, FILE-1.gif... by name",
+    )
+    add("--episode", type=_whole(0), metavar="K", help="its number; default: the first")
+    add("--fps", type=_whole(1, 1000), default=30, help="most frames a second")
 
 
 def _whole(least: int, most: int | None = None) -> Callable[[str], int]:

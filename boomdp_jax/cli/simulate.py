@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> None:
         spec = load_scene(arguments.scene)
         print_notes(spec.notes)
         actions = load_actions(arguments.actions, spec)
-        params = _load_params(arguments, spec)
+        params = spec.with_surface(_load_params(arguments, spec))
         if actions.initial_state is None:
             initial_state = spec.initial_state()
         else:

@@ -230,6 +230,7 @@ class Posterior(eqx.Module):
         )
         with jax.ensure_compile_time_eval():
             scene = self.spec.scene
+        params = self.spec.with_surface(params)
         next_state, _ = step(scene, params, state, wrench)
         return add_reading_noise(noise_key, next_state, noise_scale, scene.is_static)
 

@@ -78,7 +78,7 @@ def predict(
     moments = _predict_rows(
         key,
         scene,
-        kept.params,
+        posterior.spec.with_surface(kept.params),
         kept.noise_scale,
         history,
         tuple(horizons),

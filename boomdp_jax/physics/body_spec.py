@@ -77,6 +77,10 @@ class BodySpec:
     """Centre of mass as given [m]; None: the centroid, or unknown."""
     is_center_unknown: bool = False
     """Whether the centre of mass is to be inferred."""
+    has_contact: bool = False
+    """Whether the file says what contact with it is like."""
+    group: str | None = None
+    """Bodies of the same group do not touch each other; None: of no group."""
 
     @functools.cached_property
     def moments(self) -> ShapeMoments:
@@ -165,8 +169,9 @@ def read_body(value: object, source: str, index: int) -> BodySpec:
     contact = read_object(
         fields.get("contact", {}),
         f"{where}: contact",
-        optional=("friction", "restitution"),
+        optional=("friction", "restitution", "group"),
     )
+    group = contact.get("group")
     density = read_number(
         fields.get("density"), f"{where}: density", is_positive=True, is_nullable=True
     )
@@ -188,6 +193,8 @@ def read_body(value: object, source: str, index: int) -> BodySpec:
         center_of_mass=_read_optional_vector(fields, "center_of_mass", where, 2),
         is_center_unknown="center_of_mass" in fields
         and fields["center_of_mass"] is None,
+        has_contact="contact" in fields,
+        group=None if group is None else read_name(group, f"{where}: contact.group"),
     )
     _check_body(body, where)
     return body
@@ -211,13 +218,15 @@ def body_to_dict(body: BodySpec) -> dict:
     if body.pose is not None:
         entry["pose"] = body.pose.tolist()
     entry["twist"] = body.twist.tolist()
-    contact = {"friction": body.friction, "restitution": body.restitution}
-    contact = {
+    numbers = {"friction": body.friction, "restitution": body.restitution}
+    contact: dict[str, float | str | None] = {
         key: None if math.isnan(number) else number
-        for key, number in contact.items()
+        for key, number in numbers.items()
         if number is not None
     }
-    if contact:
+    if body.group is not None:
+        contact["group"] = body.group
+    if body.has_contact:
         entry["contact"] = contact
     if body.is_center_unknown:
         entry["center_of_mass"] = None

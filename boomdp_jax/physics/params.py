@@ -69,6 +69,19 @@ class Ground(eqx.Module):
     """Offset of the centre of load from the feet's own, body frame [m]."""
 
 
+class Surface(eqx.Module):
+    """What a body's outline does to others that touch it.
+
+    Two bodies rub with the geometric mean of their coefficients, and bounce with the
+    larger of their restitutions.
+    """
+
+    friction: Float[Array, "*batch body"]
+    """Coefficient of dry friction."""
+    restitution: Float[Array, "*batch body"]
+    """Speed after an impact over that before, in [0, 1]."""
+
+
 class Params(eqx.Module):
     """One hypothesis Φ. Structure is which slots are active; shapes never change."""
 
@@ -78,6 +91,8 @@ class Params(eqx.Module):
     distance: Distance
     wheel: Wheel
     ground: Ground
+    surface: Surface | None = None
+    """What contact is like; needed in scenes with contact (`Scene.collides`)."""
 
 
 def empty_params(
@@ -88,6 +103,8 @@ def empty_params(
     num_wheel: int = 0,
     num_ground: int = 0,
     density: float = 1.0,
+    friction: float = 0.5,
+    restitution: float = 0.0,
 ) -> Params:
     """Params with every slot inactive and holding zeros.
 
@@ -98,6 +115,8 @@ def empty_params(
         num_wheel: wheel slots of each body.
         num_ground: ground slots of each body.
         density: density of every body [kg/m²].
+        friction: contact friction of every body.
+        restitution: contact restitution of every body.
 
     Returns:
         The params, unbatched, without law-shape nuisances.
@@ -133,5 +152,9 @@ def empty_params(
             active=on_device(np.zeros((num_bodies, num_ground)), bool),
             dry=on_device(np.zeros((num_bodies, num_ground))),
             viscous=on_device(np.zeros((num_bodies, num_ground))),
+        ),
+        surface=Surface(
+            friction=on_device(np.full(num_bodies, friction)),
+            restitution=on_device(np.full(num_bodies, restitution)),
         ),
     )

@@ -31,8 +31,13 @@ class Scene(eqx.Module):
     """Gravity across the plane, the load on floor and wheels [m/s²]."""
     dt: Float[Array, "*batch"]
     """Default length of a step [s]."""
+    collides: Bool[Array, "*batch body body"] | None = None
+    """Which bodies may touch each other, symmetric; None: there is no contact. Bodies
+    that a joint connects do not touch, whatever this says."""
     num_substeps: int = eqx.field(static=True, default=2)
     """Equal parts into which a step is cut."""
+    num_sweeps: int = eqx.field(static=True, default=1)
+    """Iterations over all contacts in which a substep finds where bodies go."""
 
     @property
     def num_bodies(self) -> int:

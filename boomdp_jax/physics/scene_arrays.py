@@ -13,6 +13,7 @@ from boomdp_jax.physics.params import (
     Ground,
     Params,
     Revolute,
+    Surface,
     Wheel,
 )
 from boomdp_jax.physics.scene import Scene
@@ -22,6 +23,10 @@ MIN_VERTICES = 4
 
 MIN_FEET = 4
 """Least room for feet, likewise."""
+
+
+DEFAULT_FRICTION, DEFAULT_RESTITUTION = 0.5, 0.0
+"""Of a body whose file does not say, in a scene with contact."""
 
 
 def build_scene(
@@ -66,7 +71,35 @@ def build_scene(
             gravity=on_device(gravity),
             normal_gravity=on_device(normal_gravity),
             dt=on_device(dt),
+            collides=_collides(bodies),
+            num_substeps=4 if has_contact(bodies) else 2,
         )
+
+
+def has_contact(bodies: Sequence[BodySpec]) -> bool:
+    """Whether a scene has contact: one of its bodies says what that is like."""
+    return len(bodies) > 1 and any(body.has_contact for body in bodies)
+
+
+def build_surface(bodies: Sequence[BodySpec]) -> Surface | None:
+    """Lay out what contact is like.
+
+    Args:
+        bodies: bodies in the order of the file.
+
+    Returns:
+        Friction and restitution on the default float type, with defaults where a file
+        does not say or has them inferred; None in a scene without contact.
+    """
+    if not has_contact(bodies):
+        return None
+
+    def known(number: float | None, default: float) -> float:
+        return default if number is None or np.isnan(number) else number
+
+    friction = [known(body.friction, DEFAULT_FRICTION) for body in bodies]
+    restitution = [known(body.restitution, DEFAULT_RESTITUTION) for body in bodies]
+    return Surface(friction=on_device(friction), restitution=on_device(restitution))
 
 
 def build_params(
@@ -125,7 +158,17 @@ def build_params(
                 constraints, "ground", len(bodies), {"dry": (), "viscous": ()}
             )
         ),
+        surface=build_surface(bodies),
     )
+
+
+def _collides(bodies: Sequence[BodySpec]) -> jax.Array | None:
+    """All pairs but those of a group."""
+    if not has_contact(bodies):
+        return None
+    groups = [body.group for body in bodies]
+    table = [[g is None or g != h for h in groups] for g in groups]
+    return on_device(np.array(table) & ~np.eye(len(bodies), dtype=bool), bool)
 
 
 def _pad_with_last(points: np.ndarray, num: int) -> np.ndarray:

@@ -18,7 +18,11 @@ from boomdp_jax.physics.constraint_spec import (
 )
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
-from boomdp_jax.physics.scene_arrays import build_params, build_scene
+from boomdp_jax.physics.scene_arrays import (
+    build_params,
+    build_scene,
+    build_surface,
+)
 from boomdp_jax.physics.scene_fields import (
     check_finite,
     read_count,
@@ -151,6 +155,27 @@ class SceneSpec:
             ValueError: a number is to be inferred; which body, which field.
         """
         return build_params(self.bodies, self.constraints, self.source)
+
+    def with_surface(self, params: Params) -> Params:
+        """Add what the file says of contact to params that say nothing of it.
+
+        Args:
+            params: hypotheses, with any batch axes.
+
+        Returns:
+            The same with friction and restitution of every body, defaults where they
+            are unknown; params that have them, and those of a scene without contact,
+            as they are.
+        """
+        surface = build_surface(self.bodies)
+        if surface is None or params.surface is not None:
+            return params
+        shape = params.density.shape
+        surface = jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf.astype(params.density.dtype), shape),
+            surface,
+        )
+        return dataclasses.replace(params, surface=surface)
 
     def to_dict(self) -> dict:
         """What its file would hold, in terms of JSON.

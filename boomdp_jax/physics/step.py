@@ -20,36 +20,21 @@ where everything sticks: there the motion does not depend on the dry limits at a
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from boomdp_jax.core.holding import hold, runtime_one
-from boomdp_jax.physics.joints import (
-    Frames,
-    joint_rows,
-)
+from boomdp_jax.physics.contact_rollout import contact_rollout, contact_step
+from boomdp_jax.physics.general_step import general_substep
 from boomdp_jax.physics.lone_body import LoneBody
 from boomdp_jax.physics.lone_step import lone_step
 from boomdp_jax.physics.motion import Motion, motion_of, scalars, state_of
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.prepare import Prepared, prepare
-from boomdp_jax.physics.projection import compliance_of, project
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
-from boomdp_jax.physics.trigonometry import sincos
-from boomdp_jax.physics.velocity_solve import VelocityProblem, solve_velocity
-
-
-class StepInfo(eqx.Module):
-    """What a step reports and nobody needs to carry."""
-
-    constraint_error: Float[Array, "*batch"]
-    """Largest distance by which an active joint fails to hold after the step [m]."""
-    is_finite: Bool[Array, "*batch"]
-    cache: Any = None
-    """What a solver may reuse in the next step; nothing is needed without contact."""
+from boomdp_jax.physics.step_info import StepInfo as StepInfo
+from boomdp_jax.physics.step_info import report
 
 
 def step(
@@ -75,8 +60,9 @@ def step(
     Returns:
         The next state, and what there is to report.
     """
-    del cache  # No solver of this engine needs one without contact.
     length = jnp.asarray(scene.dt if dt is None else dt, state.pose.dtype)
+    if scene.collides is not None:
+        return contact_step(scene, params, state, wrench, length, cache)
     prepared = prepare(scene, params, length)
     motion, info = _step(scene, prepared, motion_of(state), wrench)
     return state_of(motion, scene.num_bodies), info
@@ -100,6 +86,10 @@ def prepare_step(
         is to report; the same as `step`.
     """
     length = jnp.asarray(scene.dt if dt is None else dt, scene.area.dtype)
+    if scene.collides is not None:
+        return lambda state, wrench: contact_step(
+            scene, params, state, wrench, length, None
+        )
     prepared = prepare(scene, params, length)
 
     def advance(state: State, wrench: Float[Array, "body 3"]) -> tuple[State, StepInfo]:
@@ -133,6 +123,8 @@ def rollout(
         The states after each step and their reports, with a leading time axis.
     """
     length = jnp.asarray(scene.dt if dt is None else dt, state.pose.dtype)
+    if scene.collides is not None:
+        return contact_rollout(scene, params, state, wrenches, length)
     constant = prepare(scene, params, length) if length.ndim == 0 else None
 
     def advance(motion, inputs):
@@ -161,90 +153,12 @@ def _step(
         )
         return motion, StepInfo(constraint_error=error, is_finite=is_finite)
     if scene.num_substeps == 1:
-        motion = _substep(prepared, motion, force)
-        return motion, _info(prepared, motion)
+        motion = general_substep(prepared, motion, force)
+        return motion, report(prepared, motion)
     motion, _ = jax.lax.scan(
-        lambda m, _: (_substep(prepared, m, force), None),
+        lambda m, _: (general_substep(prepared, m, force), None),
         motion,
         None,
         length=scene.num_substeps,
     )
-    return motion, _info(prepared, motion)
-
-
-def _substep(prepared: Prepared, motion: Motion, force) -> Motion:
-    h, mobile = prepared.length, prepared.mobile
-    mass, inertia = prepared.mass, prepared.inertia
-    vx, vy, spin = (mobile * v for v in motion[3:])
-    one = runtime_one(mass)
-
-    def held(values):
-        return jax.tree.map(lambda v: hold(v, one), values)
-
-    half_turn = 0.5 * h * spin
-    sin, cos = held(sincos(motion.theta + half_turn))
-    start = held((cos * vx + sin * vy, cos * vy - sin * vx, spin))
-    push_x = mobile * (h * force[0] + prepared.weight[0])
-    push_y = mobile * (h * force[1] + prepared.weight[1])
-    momentum = held(
-        (
-            mass * start[0] + cos * push_x + sin * push_y,
-            mass * start[1] + cos * push_y - sin * push_x,
-            inertia * spin + mobile * h * force[2],
-        )
-    )
-    sin_half, cos_half = held(sincos(half_turn))
-    rows_mid, rows_end, compliance = [], [], []
-    if prepared.slots:
-        middle = Frames(motion.x + 0.5 * h * vx, motion.y + 0.5 * h * vy, cos, sin)
-        end = Frames(
-            motion.x + h * vx, motion.y + h * vy, cos, sin, (cos_half, sin_half)
-        )
-        rows_mid = joint_rows(prepared.slots, middle)
-        rows_end = joint_rows(prepared.slots, end)
-        compliance = compliance_of(prepared, rows_mid)
-    solution = solve_velocity(
-        VelocityProblem(
-            mass=mass,
-            inertia=inertia,
-            momentum=momentum,
-            start=start,
-            turn=(cos_half, sin_half),
-            contacts=prepared.contacts,
-            spins=prepared.spins,
-            rows_mid=rows_mid,
-            rows_end=rows_end,
-            compliance=compliance,
-            joint_spins=prepared.joint_spins,
-        )
-    )
-    wx, wy, new_spin = held(solution.twist)
-    new_vx, new_vy = cos * wx - sin * wy, sin * wx + cos * wy
-    moved = held(
-        Motion(
-            motion.x + 0.5 * h * (vx + new_vx),
-            motion.y + 0.5 * h * (vy + new_vy),
-            motion.theta + 0.5 * h * (spin + new_spin),
-            new_vx,
-            new_vy,
-            new_spin,
-        )
-    )
-    if not prepared.slots:
-        return moved
-    return project(prepared, moved)
-
-
-def _info(prepared: Prepared, motion: Motion) -> StepInfo:
-    """Joint drift and finiteness of a motion."""
-    square = jnp.zeros((), motion.x.dtype)
-    if prepared.slots:
-        sin, cos = sincos(motion.theta)
-        frames = Frames(motion.x, motion.y, cos, sin)
-        for slot in prepared.slots:
-            drift = sum(row.error**2 for row in joint_rows([slot], frames))
-            square = jnp.maximum(square, drift)
-    has_error = square > 0
-    error = jnp.where(has_error, jnp.sqrt(jnp.where(has_error, square, 1.0)), 0.0)
-    total = jnp.sum(sum(motion))
-    return StepInfo(constraint_error=error, is_finite=jnp.isfinite(total))
+    return motion, report(prepared, motion)

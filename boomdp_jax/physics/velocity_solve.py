@@ -163,8 +163,17 @@ def _residual(
     return tuple(out), tail
 
 
-def _slopes(problem: VelocityProblem, w: Twist, before: Twist | None = None):
-    """K of every friction at a twist."""
+def slopes_of(problem: VelocityProblem, w: Twist, before: Twist | None = None):
+    """K of every friction at a twist.
+
+    Args:
+        problem: frictions.
+        w: the twist.
+        before: the twist in the iteration before (see `friction.is_reversed`).
+
+    Returns:
+        Of contacts, of spins and of joints between two bodies.
+    """
     start, contact, spin = problem.start, problem.contacts, problem.spins
     k_contact = k_spin = None
     if contact is not None:
@@ -184,8 +193,17 @@ def _slopes(problem: VelocityProblem, w: Twist, before: Twist | None = None):
     return k_contact, k_spin, k_joints
 
 
-def _damped_inertia(problem: VelocityProblem, k_contact, k_spin):
-    """M + T^T K Theta T, as rows of entries."""
+def damped_inertia(problem: VelocityProblem, k_contact, k_spin):
+    """M + T^T K Theta T, as rows of entries.
+
+    Args:
+        problem: masses and frictions.
+        k_contact: K of contacts (`slopes_of`).
+        k_spin: K of spins.
+
+    Returns:
+        What momentum per twist is like to forces from outside.
+    """
     zero = jnp.zeros_like(problem.mass)
     a = [
         [problem.mass, zero, zero],
@@ -216,7 +234,7 @@ def _solve_linear(
     def held(values):
         return jax.tree.map(lambda v: hold(v, one), values)
 
-    inverse = held(inverse3(held(_damped_inertia(problem, k_contact, k_spin))))
+    inverse = held(inverse3(held(damped_inertia(problem, k_contact, k_spin))))
     free = matvec3(inverse, held(rhs))
     num, num_joints = len(problem.rows_mid), len(problem.joint_spins)
     if num + num_joints == 0:
@@ -261,13 +279,13 @@ def _newton(problem: VelocityProblem) -> Solution:
     rest = Solution((zero, zero, zero), [jnp.zeros((), zero.dtype)] * num)
     # Sticking is the viscous law without limits, whose solution is one linear solve.
     sticking = _unlimited(problem)
-    solution = _newton_step(sticking, rest, None)
+    solution = newton_step(sticking, rest, None)
     if problem.contacts is None and problem.spins is None and not problem.joint_spins:
         return solution
 
     def advance(_, pair):
         solution, before = pair
-        return _newton_step(problem, solution, before), solution.twist
+        return newton_step(problem, solution, before), solution.twist
 
     first = (solution, solution.twist)
     return jax.lax.fori_loop(0, NUM_NEWTON, advance, first)[0]
@@ -286,13 +304,23 @@ def _unlimited(problem: VelocityProblem) -> VelocityProblem:
     )
 
 
-def _newton_step(
+def newton_step(
     problem: VelocityProblem, solution: Solution, before: Twist | None
 ) -> Solution:
+    """One iteration of Newton's method.
+
+    Args:
+        problem: momenta, frictions and joint rows.
+        solution: where it starts.
+        before: the twist in the iteration before.
+
+    Returns:
+        Twists and impulses of the system linearised there.
+    """
     out, tail = _residual(problem, solution, before)
     step = _solve_linear(
         problem,
-        _slopes(problem, solution.twist, before),
+        slopes_of(problem, solution.twist, before),
         tuple(-o for o in out),
         [-t for t in tail],
     )
@@ -337,7 +365,7 @@ def solve_velocity(problem: VelocityProblem) -> Solution:
         )
         tangent = _solve_linear(
             problem,
-            _slopes(problem, solution.twist),
+            slopes_of(problem, solution.twist),
             tuple(-o for o in out),
             [-t for t in tail],
         )

@@ -76,7 +76,7 @@ def draw_prediction(
     draws = _sample(
         jax.random.key(0) if key is None else key,
         scene,
-        kept.params,
+        spec.with_surface(kept.params),
         kept.noise_scale,
         jnp.broadcast_to(reading, (count, *reading.shape)),
         jnp.broadcast_to(history.action[rows], (count, *history.action[rows].shape)),

@@ -1,0 +1,267 @@
+r"""The contacts of a step, and how a substep moves under them.
+
+Once a step contacts are found (`find_contacts`). A substep then
+
+1. has twists as they would be without contact, with the impulses of the substep before
+   applied;
+2. sweeps over all contacts until nothing overlaps at its end; where friction or joints
+   act, each sweep is followed by an iteration of theirs under the impulses found;
+3. moves bodies with the twists that result; those that touch nothing move with the mean
+   of old and new twist, which is of second order;
+4. sweeps once more without what was added to part overlapping bodies: surfaces that
+   touched do not approach, and bounce where they met fast.
+
+All arrays are in lanes (`core.lanes`).
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from boomdp_jax.core.one_loop import one_loop
+from boomdp_jax.physics.contact_rows import (
+    Ease,
+    Rows,
+    Side,
+    add_pushes,
+    begin,
+    part,
+    settle,
+)
+from boomdp_jax.physics.contact_world import ContactWorld, Fixed
+from boomdp_jax.physics.motion import Motion
+from boomdp_jax.physics.tournament import (
+    Halves,
+    moved_on,
+    seated,
+    unseated,
+)
+from boomdp_jax.physics.trigonometry import heading_turn
+
+NUM_POINTS = 2
+"""Points of a contact."""
+
+Impulses = list[list[tuple]]
+"""Of each round's pairs: normal and tangential, of both points; `[pair, lane]`."""
+
+
+class Contacts(NamedTuple):
+    """All contacts of a step."""
+
+    rows: list[Rows]
+    """Round by round, `[pair, lane]`."""
+    overlap: Float[Array, " lane"]
+    """Deepest, when they were found [m]."""
+
+
+class Touch(NamedTuple):
+    """What contacts carry from substep to substep."""
+
+    impulses: Impulses
+    sums: tuple
+    """Impulse and moment of them on every body, world frame; `[body, lane]`."""
+
+
+class _Pose(NamedTuple):
+    """What a contact depends on and changes, of one body."""
+
+    x: Any
+    y: Any
+    corner_x: list
+    corner_y: list
+
+
+def over_pairs(function, *arguments):
+    """Apply a function of scalars along pairs and lanes, in one loop."""
+    return jax.vmap(jax.vmap(lambda *scalars: one_loop(function, *scalars)))(*arguments)
+
+
+def find_contacts(
+    world: ContactWorld, motion: Motion, impulses: Impulses
+) -> tuple[Contacts, Touch]:
+    """Find the contacts of a step.
+
+    Args:
+        world: outlines, filters and surfaces.
+        motion: at the start of the step.
+        impulses: at the end of the step before; zeros if that is not known.
+
+    Returns:
+        The contacts, and what the first substep starts with.
+    """
+    num_bodies = motion.x.shape[0]
+    cos, sin = heading_turn(motion.theta)
+    outlines = world.outlines
+    corners = list(zip(outlines.corner_x, outlines.corner_y, strict=True))
+    pose = _Pose(
+        x=motion.x,
+        y=motion.y,
+        corner_x=[cos * x - sin * y for x, y in corners],
+        corner_y=[sin * x + cos * y for x, y in corners],
+    )
+    halves, rows, kept, nearest = seated(pose, num_bodies), [], [], []
+    zero = jnp.zeros_like(motion.x)
+    sums = seated((zero, zero, zero), num_bodies)
+    for fixed, eases, allowed, before in zip(
+        world.fixed, world.eases, world.allowed, impulses, strict=True
+    ):
+        start = over_pairs(_begin, *fixed, *halves, allowed, before, *eases)
+        rows.append(start.rows)
+        kept.append(start.impulses)
+        nearest.append(jnp.min(start.separation, axis=0))
+        sums = over_pairs(add_pushes, start.rows, start.impulses, sums)
+        halves, sums = moved_on(halves), moved_on(sums)
+    overlap = jnp.maximum(-functools.reduce(jnp.minimum, nearest), 0.0)
+    return Contacts(rows, overlap), Touch(kept, unseated(sums, num_bodies))
+
+
+def _begin(
+    fixed_a: Fixed, fixed_b: Fixed, pose_a, pose_b, allowed, impulses, ease_a, ease_b
+):
+    return begin(
+        Side(*pose_a, *fixed_a, ease_a),
+        Side(*pose_b, *fixed_b, ease_b),
+        allowed,
+        impulses,
+    )
+
+
+def part_all(
+    contacts: Contacts,
+    eases: list[Halves],
+    rate: Float[Array, " lane"],
+    moved: tuple,
+    twists: tuple,
+    impulses: Impulses,
+) -> tuple[tuple, Impulses]:
+    """Sweep once over all contacts before bodies are moved (`contact_rows.part`).
+
+    Args:
+        contacts: of this step.
+        eases: of both bodies of each pair, round by round.
+        rate: one over the length of the substep [1/s].
+        moved: displacement of every body in this step.
+        twists: of every body; numbers after the third are sums of impulses.
+        impulses: so far.
+
+    Returns:
+        Twists and impulses.
+    """
+    num_bodies, after = moved[0].shape[0], []
+    twists, moved = seated(twists, num_bodies), seated(moved, num_bodies)
+    rate = jnp.broadcast_to(rate[None], moved[0][0].shape)
+    for rows, ease, before in zip(contacts.rows, eases, impulses, strict=True):
+        twists, impulse = over_pairs(part, rows, ease, rate, moved, twists, before)
+        after.append(impulse)
+        twists, moved = moved_on(twists), moved_on(moved)
+    return unseated(twists, num_bodies), after
+
+
+def settle_all(
+    contacts: Contacts,
+    eases: list[Halves],
+    before: tuple,
+    twists: tuple,
+    impulses: Impulses,
+) -> tuple[tuple, Impulses]:
+    """Sweep over all contacts after bodies were moved (`contact_rows.settle`).
+
+    Args:
+        contacts: of this step.
+        eases: of both bodies of each pair, round by round.
+        before: twists of every body when the substep began.
+        twists: of every body; numbers after the third are sums of impulses.
+        impulses: so far.
+
+    Returns:
+        Twists and impulses.
+    """
+    num_bodies, after = twists[0].shape[0], []
+    twists, before = seated(twists, num_bodies), seated(before, num_bodies)
+    for rows, ease, impulse in zip(contacts.rows, eases, impulses, strict=True):
+        twists, impulse = over_pairs(settle, rows, ease, before, twists, impulse)
+        after.append(impulse)
+        twists, before = moved_on(twists), moved_on(before)
+    return unseated(twists, num_bodies), after
+
+
+def contact_substep(
+    contacts: Contacts,
+    eases: list[Halves],
+    ease: Ease,
+    length: Float[Array, " lane"],
+    motion: Motion,
+    moved: tuple,
+    free: tuple,
+    touch: Touch,
+    num_sweeps: int,
+) -> tuple[Motion, Touch]:
+    """Advance by one substep a world in which nothing but contact holds bodies.
+
+    Args:
+        contacts: of this step.
+        eases: of both bodies of each pair, round by round.
+        ease: of every body.
+        length: of the substep [s].
+        motion: at its start.
+        moved: displacement of every body in this step.
+        free: twists at the end if there were no contact, world frame.
+        touch: from the substep before.
+        num_sweeps: iterations before positions are moved.
+
+    Returns:
+        The motion at the end, and what the next substep starts with.
+    """
+    given = ease(touch.sums)
+    start = tuple(v + dv for v, dv in zip(free, given, strict=True))
+    twists, impulses = start, touch.impulses
+    for _ in range(num_sweeps):
+        twists, impulses = part_all(
+            contacts, eases, 1.0 / length, moved, twists, impulses
+        )
+    touches = functools.reduce(
+        jnp.logical_or, [c != 0.0 for c in _changes(twists, free, given)]
+    )
+    place = moved_with(motion, touches, twists, length)
+    final, impulses = settle_all(contacts, eases, tuple(motion[3:]), twists, impulses)
+    # What the impulses on a body sum up to follows from what they did to it.
+    sums = tuple(
+        jnp.where(e > 0.0, change / jnp.where(e > 0.0, e, 1.0), 0.0)
+        for change, e in zip(_changes(final, free, given), ease[:3], strict=True)
+    )
+    return Motion(*place, *final), Touch(impulses, sums)
+
+
+def _changes(twists: tuple, free: tuple, given: tuple) -> list:
+    """What contacts did to twists, exactly zero where it is only rounding.
+
+    An impulse given at first and taken back leaves some; a body in flight would then
+    count as touching from time to time.
+    """
+    changes = []
+    for new, old, first in zip(twists, free, given, strict=True):
+        change = new - old
+        rounding = 32.0 * jnp.finfo(new.dtype).eps * (jnp.abs(old) + jnp.abs(first))
+        changes.append(jnp.where(jnp.abs(change) > rounding, change, 0.0))
+    return changes
+
+
+def moved_with(motion: Motion, touches, twists: tuple, length) -> list:
+    """Poses at the end of a substep.
+
+    Args:
+        motion: at the start.
+        touches: which bodies any impulse came to.
+        twists: before positions are moved.
+        length: of the substep [s].
+
+    Returns:
+        x, y and theta.
+    """
+    return [
+        place + length[None] * jnp.where(touches, new, 0.5 * (old + new))
+        for place, old, new in zip(motion[:3], motion[3:], twists, strict=True)
+    ]

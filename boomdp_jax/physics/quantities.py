@@ -1,0 +1,176 @@
+r"""Energy, momentum and joint drift of a state: what the laws of motion keep or not.
+
+All are functions of one world; the caller adds `vmap` over time or hypotheses. Static
+bodies are left out: whatever holds them takes up any momentum, and they do no work.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from boomdp_jax.core.arrays import FloatScalar
+from boomdp_jax.physics.params import WORLD, Distance, Params, Revolute
+from boomdp_jax.physics.scene import Scene
+from boomdp_jax.physics.state import State
+
+
+def mass_and_inertia(
+    scene: Scene, params: Params
+) -> tuple[Float[Array, " body"], Float[Array, " body"]]:
+    r"""Mass and rotational inertia of every body that moves.
+
+    $m = d A$ and $I = m k^2$, with density d, area A and radius of gyration k.
+
+    Args:
+        scene: outlines.
+        params: one hypothesis.
+
+    Returns:
+        Masses [kg] and inertias about the centres of mass [kg m²]; zero for a static
+        body, so that it adds nothing to a sum.
+    """
+    mass = jnp.where(scene.is_static, 0.0, params.density * scene.area)
+    return mass, mass * scene.gyration
+
+
+def kinetic_energy(scene: Scene, params: Params, state: State) -> FloatScalar:
+    r"""Energy of motion, $\sum_i (m_i |v_i|^2 + I_i \omega_i^2)/2$.
+
+    Args:
+        scene: outlines.
+        params: one hypothesis.
+        state: poses and twists.
+
+    Returns:
+        The energy [J].
+    """
+    mass, inertia = mass_and_inertia(scene, params)
+    square = jnp.sum(state.twist[:, :2] ** 2, axis=-1)
+    return 0.5 * jnp.sum(mass * square + inertia * state.twist[:, 2] ** 2)
+
+
+def potential_energy(scene: Scene, params: Params, state: State) -> FloatScalar:
+    r"""Energy in the in-plane gravity, $-\sum_i m_i \, g \cdot x_i$.
+
+    Args:
+        scene: outlines and gravity.
+        params: one hypothesis.
+        state: poses and twists.
+
+    Returns:
+        The energy [J], zero with all centres of mass at the origin of the world.
+    """
+    mass, _ = mass_and_inertia(scene, params)
+    return -jnp.sum(mass * (state.pose[:, :2] @ scene.gravity))
+
+
+def total_energy(scene: Scene, params: Params, state: State) -> FloatScalar:
+    """Kinetic and potential energy; kept where nothing rubs, hits or pushes.
+
+    Joints hold rigidly and store none.
+
+    Args:
+        scene: outlines and gravity.
+        params: one hypothesis.
+        state: poses and twists.
+
+    Returns:
+        The energy [J].
+    """
+    kinetic = kinetic_energy(scene, params, state)
+    return kinetic + potential_energy(scene, params, state)
+
+
+def linear_momentum(scene: Scene, params: Params, state: State) -> Float[Array, "2"]:
+    r"""Momentum of all bodies together, $\sum_i m_i v_i$.
+
+    Args:
+        scene: outlines.
+        params: one hypothesis.
+        state: poses and twists.
+
+    Returns:
+        The momentum [kg m/s].
+    """
+    mass, _ = mass_and_inertia(scene, params)
+    return mass @ state.twist[:, :2]
+
+
+def angular_momentum(
+    scene: Scene,
+    params: Params,
+    state: State,
+    about: Float[Array, "2"] | tuple[FloatScalar | float, FloatScalar | float] = (
+        0.0,
+        0.0,
+    ),
+) -> FloatScalar:
+    r"""Moment of momentum, $\sum_i I_i \omega_i + (x_i - o) \times m_i v_i$.
+
+    Args:
+        scene: outlines.
+        params: one hypothesis.
+        state: poses and twists.
+        about: world point o [m].
+
+    Returns:
+        The angular momentum about that point [kg m²/s].
+    """
+    mass, inertia = mass_and_inertia(scene, params)
+    arm_x, arm_y = state.pose[:, 0] - about[0], state.pose[:, 1] - about[1]
+    vx, vy, spin = state.twist.T
+    return jnp.sum(inertia * spin + mass * (arm_x * vy - arm_y * vx))
+
+
+def constraint_error(scene: Scene, params: Params, state: State) -> FloatScalar:
+    r"""Largest distance by which an active joint fails to hold.
+
+    For a pin $|p_a - p_b|$, for a rod $\big| |p_a - p_b| - L \big|$, with p the anchors
+    in the world. Wheels and floor friction constrain no pose.
+
+    Args:
+        scene: outlines; only how many bodies there are is read.
+        params: one hypothesis.
+        state: poses and twists.
+
+    Returns:
+        The distance [m]; zero where nothing is joined. Where an error is exactly zero,
+        its derivative is taken to be zero.
+
+    Raises:
+        ValueError: the state has another number of bodies than the scene.
+    """
+    if state.pose.shape[0] != scene.num_bodies:
+        raise ValueError(
+            f"Scene has {scene.num_bodies} bodies but the state {state.pose.shape[0]}; "
+            "give the state of this scene."
+        )
+    pin_gap, is_pin = _gaps(params.revolute, state)
+    rod_gap, is_rod = _gaps(params.distance, state)
+    errors = [
+        jnp.where(is_pin, pin_gap, 0.0),
+        jnp.where(is_rod, jnp.abs(rod_gap - params.distance.length), 0.0),
+    ]
+    return jnp.max(jnp.concatenate(errors), initial=0.0)
+
+
+def _gaps(
+    joint: Revolute | Distance, state: State
+) -> tuple[Float[Array, " joint"], Bool[Array, " joint"]]:
+    """Distance between the anchors of every slot, and which slots are active."""
+
+    def anchor(body, local):
+        x, y, theta = state.pose[jnp.maximum(body, 0)]
+        cos, sin = jnp.cos(theta), jnp.sin(theta)
+        turned = jnp.stack(
+            [cos * local[0] - sin * local[1], sin * local[0] + cos * local[1]]
+        )
+        return jnp.where(body == WORLD, local, jnp.stack([x, y]) + turned)
+
+    def gap(body_a, body_b, anchor_a, anchor_b):
+        square = jnp.sum((anchor(body_a, anchor_a) - anchor(body_b, anchor_b)) ** 2)
+        is_open = square > 0
+        return jnp.where(is_open, jnp.sqrt(jnp.where(is_open, square, 1.0)), 0.0)
+
+    ends = (joint.body_a, joint.body_b, joint.anchor_a, joint.anchor_b)
+    return jax.vmap(gap)(*ends), joint.active
