@@ -8,6 +8,9 @@ import pytest
 from boomdp_jax.physics import Params, Scene, rollout
 from tests.physics.contact_scenes import body, fixed, run, spec_of
 
+# A world with every kind of friction and joint takes half a minute to compile.
+pytestmark = pytest.mark.slow
+
 G = 9.81
 SEEN_FROM_ABOVE = {"gravity": (0.0, 0.0), "normal_gravity": G, "dt": 0.02}
 CONSTRAINTS = (

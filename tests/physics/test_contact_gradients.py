@@ -8,6 +8,9 @@ import pytest
 from boomdp_jax.physics import Params, State, Surface, rollout
 from tests.physics.contact_scenes import FLOOR, body, fixed, spec_of
 
+# Each of the two programs takes half a minute to compile in 64 bit.
+pytestmark = pytest.mark.slow
+
 NUM_STEPS = 15
 
 
