@@ -88,7 +88,7 @@ def coupled_substep(
     def answer(twists, sums):
         """Friction and joints under the impulses of contacts."""
         base = _from_world(twists, *turn)
-        pushed = _pushed(prepared, problem, sums, *turn)
+        pushed = _pushed(problem, sums, *turn)
         new = _along(newton_step)(pushed, Solution(base, solution.impulse), before)
         return new, base
 
@@ -131,14 +131,10 @@ def _from_world(twist: tuple, cos, sin) -> tuple:
     return cos * x + sin * y, cos * y - sin * x, spin
 
 
-def _pushed(
-    prepared: Prepared, problem: VelocityProblem, sums: tuple, cos, sin
-) -> VelocityProblem:
+def _pushed(problem: VelocityProblem, sums: tuple, cos, sin) -> VelocityProblem:
     """With the impulses of contacts among the momenta."""
     push = _from_world(sums, cos, sin)
-    momentum = tuple(
-        p + prepared.mobile * q for p, q in zip(problem.momentum, push, strict=True)
-    )
+    momentum = tuple(p + q for p, q in zip(problem.momentum, push, strict=True))
     return problem._replace(momentum=momentum)
 
 

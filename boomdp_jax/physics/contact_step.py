@@ -22,15 +22,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.one_loop import one_loop
-from boomdp_jax.physics.contact_rows import (
-    Ease,
-    Rows,
-    Side,
-    add_pushes,
-    begin,
-    part,
-    settle,
-)
+from boomdp_jax.physics.contact_impulses import part, settle
+from boomdp_jax.physics.contact_rows import Ease, Rows, Side, add_pushes, begin
 from boomdp_jax.physics.contact_world import ContactWorld, Fixed
 from boomdp_jax.physics.motion import Motion
 from boomdp_jax.physics.tournament import (
@@ -137,7 +130,7 @@ def part_all(
     twists: tuple,
     impulses: Impulses,
 ) -> tuple[tuple, Impulses]:
-    """Sweep once over all contacts before bodies are moved (`contact_rows.part`).
+    """Sweep once over all contacts before bodies are moved (`contact_impulses.part`).
 
     Args:
         contacts: of this step.
@@ -167,7 +160,7 @@ def settle_all(
     twists: tuple,
     impulses: Impulses,
 ) -> tuple[tuple, Impulses]:
-    """Sweep over all contacts after bodies were moved (`contact_rows.settle`).
+    """Sweep over all contacts after bodies were moved (`contact_impulses.settle`).
 
     Args:
         contacts: of this step.

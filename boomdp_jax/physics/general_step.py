@@ -5,14 +5,19 @@ others read is held, lest the compiler work it out again in each of them.
 """
 
 import jax
+import jax.numpy as jnp
 
 from boomdp_jax.core.holding import hold, runtime_one
-from boomdp_jax.physics.joints import Frames, joint_rows
+from boomdp_jax.physics.joints import Frames, Row, joint_rows
 from boomdp_jax.physics.motion import Motion
 from boomdp_jax.physics.prepare import Prepared
-from boomdp_jax.physics.projection import compliance_of, project
+from boomdp_jax.physics.projection import compliance_of, ease_between, project
 from boomdp_jax.physics.trigonometry import sincos
 from boomdp_jax.physics.velocity_solve import Twist, VelocityProblem, solve_velocity
+
+# Most that a row may change from mid-step to the end of a substep, squared and relative
+# in the metric of the masses: as much as a lever that turns by a quarter of a radian.
+_MOST_CHANGE = 0.06
 
 
 def velocity_problem(
@@ -56,9 +61,13 @@ def velocity_problem(
             motion.x + h * vx, motion.y + h * vy, cos, sin, (cos_half, sin_half)
         )
         rows_mid = joint_rows(prepared.slots, middle)
-        rows_end = joint_rows(prepared.slots, end)
+        rows_end = [
+            _steadied(prepared, *rows)
+            for rows in zip(rows_mid, joint_rows(prepared.slots, end), strict=True)
+        ]
         compliance = compliance_of(prepared, rows_mid)
     problem = VelocityProblem(
+        mobile=mobile,
         mass=mass,
         inertia=inertia,
         momentum=momentum,
@@ -72,6 +81,27 @@ def velocity_problem(
         joint_spins=prepared.joint_spins,
     )
     return problem, (cos, sin)
+
+
+def _steadied(prepared: Prepared, mid: Row, end: Row) -> Row:
+    """The row at the end of the substep, or at mid-step if it turns too far.
+
+    Impulses act along one and joints hold along the other. As long as both are alike
+    that is of second order; when they are not (a fast spin, a short rod) the system may
+    be anything but positive, and give energy.
+    """
+    at_mid, at_end = (ease_between(prepared, row, row) for row in (mid, end))
+    change = at_mid + at_end - 2.0 * ease_between(prepared, mid, end)
+    is_steady = change <= _MOST_CHANGE * at_mid
+
+    def choose(yes, no):
+        return jnp.where(is_steady, yes, no)
+
+    jb = None
+    if mid.jb is not None and end.jb is not None:
+        jb = tuple(choose(e, m) for e, m in zip(end.jb, mid.jb, strict=True))
+    ja = tuple(choose(e, m) for e, m in zip(end.ja, mid.ja, strict=True))
+    return end._replace(ja=ja, jb=jb)
 
 
 def general_substep(prepared: Prepared, motion: Motion, force: tuple) -> Motion:

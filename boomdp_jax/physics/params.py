@@ -103,7 +103,7 @@ def empty_params(
     num_wheel: int = 0,
     num_ground: int = 0,
     density: float = 1.0,
-    friction: float = 0.5,
+    friction: float | None = None,
     restitution: float = 0.0,
 ) -> Params:
     """Params with every slot inactive and holding zeros.
@@ -115,8 +115,9 @@ def empty_params(
         num_wheel: wheel slots of each body.
         num_ground: ground slots of each body.
         density: density of every body [kg/m²].
-        friction: contact friction of every body.
-        restitution: contact restitution of every body.
+        friction: contact friction of every body; None: the params have no surface,
+            which scenes with contact need.
+        restitution: contact restitution of every body, if there is a surface.
 
     Returns:
         The params, unbatched, without law-shape nuisances.
@@ -153,7 +154,9 @@ def empty_params(
             dry=on_device(np.zeros((num_bodies, num_ground))),
             viscous=on_device(np.zeros((num_bodies, num_ground))),
         ),
-        surface=Surface(
+        surface=None
+        if friction is None
+        else Surface(
             friction=on_device(np.full(num_bodies, friction)),
             restitution=on_device(np.full(num_bodies, restitution)),
         ),

@@ -11,7 +11,7 @@ from boomdp_jax.physics.small_linear import solve_rows
 from boomdp_jax.physics.trigonometry import sincos
 
 
-def _ease(prepared: Prepared, row: Row, other: Row):
+def ease_between(prepared: Prepared, row: Row, other: Row):
     """J M^-1 J^T between two rows."""
     p, q = row.push(), other.push()
     total = (p[0] * q[0] + p[1] * q[1]) * (prepared.mobile / prepared.mass)
@@ -23,7 +23,7 @@ def compliance_of(prepared: Prepared, rows: list[Row]):
     tiny = 0.03 * jnp.sqrt(jnp.finfo(prepared.mass.dtype).eps)
     out = []
     for row in rows:
-        ease = _ease(prepared, row, row)
+        ease = ease_between(prepared, row, row)
         out.append(jnp.where(ease > 0, tiny * ease, 1.0))
     return out
 
@@ -68,7 +68,8 @@ def _correction(prepared: Prepared, motion: Motion, cos, sin, twist):
     compliance = compliance_of(prepared, rows)
     matrix = [
         [
-            _ease(prepared, rows[i], rows[j]) + (compliance[i] if i == j else 0.0)
+            ease_between(prepared, rows[i], rows[j])
+            + (compliance[i] if i == j else 0.0)
             for j in range(len(rows))
         ]
         for i in range(len(rows))

@@ -36,6 +36,8 @@ Twist = tuple[PerBody, PerBody, PerBody]
 class VelocityProblem(NamedTuple):
     """Everything that the velocity update depends on."""
 
+    mobile: PerBody
+    """One, or zero for a static body, which nothing moves."""
     mass: PerBody
     inertia: PerBody
     momentum: Twist
@@ -234,7 +236,8 @@ def _solve_linear(
     def held(values):
         return jax.tree.map(lambda v: hold(v, one), values)
 
-    inverse = held(inverse3(held(damped_inertia(problem, k_contact, k_spin))))
+    inverse = inverse3(held(damped_inertia(problem, k_contact, k_spin)))
+    inverse = held([[problem.mobile * entry for entry in row] for row in inverse])
     free = matvec3(inverse, held(rhs))
     num, num_joints = len(problem.rows_mid), len(problem.joint_spins)
     if num + num_joints == 0:

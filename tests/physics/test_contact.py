@@ -81,9 +81,11 @@ def test_two_balls_collide_by_newtons_law(restitution, precision):
 
 
 def test_cradle_of_five_hands_the_speed_on():
+    # Gaps wider than what a ball moves in a substep: through narrower ones it pushes
+    # all of them at once.
     contact = {"friction": 0.0, "restitution": 1.0}
     balls = [
-        body(f"ball{i}", 0.1, (0.201 * i, 0.0, 0.0), **contact) for i in range(1, 5)
+        body(f"ball{i}", 0.1, (0.206 * i, 0.0, 0.0), **contact) for i in range(1, 5)
     ]
     first = body("ball0", 0.1, (-0.2, 0.0, 0.0), (1.0, 0.0, 0.0), **contact)
     _, _, last = run(spec_of(first, *balls, gravity=(0.0, 0.0)), 60)

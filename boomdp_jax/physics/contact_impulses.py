@@ -1,0 +1,240 @@
+r"""How the impulses of one contact are put right, given those of all others.
+
+Projected Gauss-Seidel: $\lambda \leftarrow \Pi(\lambda - (\dot C + b)/K)$ with its
+projection on what is allowed, rows of a pair one after another, pairs without a common
+body at once. The two normal rows of a pair are solved together and exactly.
+
+Compared on a tower of five boxes at 60 Hz, ten seconds, four substeps of one sweep
+each (deepest overlap while the impulses build up, where it ends, and how far the tower
+strayed): as it is 0.75, 0.55 and 1.9 mm; normal rows one after another 0.92, 0.55 and
+2.5 mm; without softness, as Baumgarte (1972) has it, 0.72, 0.00 and 1.6 mm, but with a
+box of a hundred times the mass on top it collapses, while the soft one stands 14 mm
+deep; two substeps 3.5, 2.2 and 7.9 mm; two substeps of two sweeps 2.3, 2.2 and 6.9 mm,
+so that a substep is worth more than a sweep (Macklin et al. 2019, Small steps in
+physics simulation). Second sweeps in opposite order, and leaving the impulses of an
+impact out of the next start, made heaps worse.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from boomdp_jax.core.arrays import FloatScalar
+from boomdp_jax.physics.contact_rows import (
+    Ease,
+    Impulse,
+    Row,
+    Rows,
+    Twist,
+    gain_of,
+    pushes,
+)
+
+PUSH_SPEED = 1.0
+"""Greatest speed at which overlapping bodies are moved apart [m/s]. It moves them and
+is not left in their twists."""
+
+# Impacts slower than this do not bounce [m/s]; a bouncing ball comes to rest at it.
+_REST_SPEED = 0.05
+
+# An overlap is undone like that of a damped spring with a quarter of the substep rate
+# as its frequency and ten times critical damping: faster and stacks shake, slower and
+# they sink (Catto 2024, Solver2D, "soft step").
+_TURN = 0.5 * jnp.pi
+_DAMPING = 10.0
+_SHARE = float(_TURN / (2.0 * _DAMPING + _TURN))
+"""Part of an overlap that one substep undoes."""
+_SOFTNESS = float(1.0 / (1.0 + _TURN * (2.0 * _DAMPING + _TURN)))
+"""Part of an overlapping point's impulse that is given up in an iteration."""
+
+
+def part(
+    rows: Rows,
+    eases: tuple[Ease, Ease],
+    rate: FloatScalar,
+    moved: tuple[Twist, Twist],
+    twists: tuple[tuple, tuple],
+    impulses: list[Impulse],
+) -> tuple[tuple[tuple, tuple], list[Impulse]]:
+    """Put a contact right so that nothing overlaps at the end of the substep.
+
+    Args:
+        rows: the contact.
+        eases: of both bodies.
+        rate: one over the length of the substep [1/s].
+        moved: displacement of both bodies since the contact was found [m, m, rad].
+        twists: of both; numbers after the third are sums of impulses.
+        impulses: so far.
+
+    Returns:
+        Twists and impulses.
+    """
+
+    def demand(row: Row, normal) -> _Demand:
+        shift = jnp.zeros_like(normal)
+        for side, sign in ((0, -1.0), (1, 1.0)):
+            x, y, angle = moved[side]
+            turned = row.normal_arms[side] * angle
+            turned = turned - row.tangent_arms[side] * (0.5 * angle * angle)
+            shift = shift + sign * (rows.normal[0] * x + rows.normal[1] * y + turned)
+        slack = rate * (row.separation + shift)
+        is_apart = slack > 0.0
+        bias = jnp.where(is_apart, slack, jnp.maximum(_SHARE * slack, -PUSH_SPEED))
+        kept = jnp.where(is_apart, 1.0, 1.0 - _SOFTNESS)
+        return _Demand(-bias, kept, jnp.ones_like(kept))
+
+    return _swept(rows, eases, twists, impulses, demand, is_rubbing_last=False)
+
+
+def settle(
+    rows: Rows,
+    eases: tuple[Ease, Ease],
+    before: tuple[Twist, Twist],
+    twists: tuple[tuple, tuple],
+    impulses: list[Impulse],
+) -> tuple[tuple[tuple, tuple], list[Impulse]]:
+    """Put a contact right once positions are done with.
+
+    Surfaces that touched do not approach, and bounce if they met fast; others are left
+    alone.
+
+    Args:
+        rows: the contact.
+        eases: of both bodies.
+        before: twists of both when the substep began.
+        twists: of both; numbers after the third are sums of impulses.
+        impulses: so far.
+
+    Returns:
+        Twists and impulses.
+    """
+    (ax, ay, a_spin), (bx, by, b_spin) = before
+    along = rows.normal[0] * (bx - ax) + rows.normal[1] * (by - ay)
+
+    def demand(row: Row, normal) -> _Demand:
+        speed = along + row.normal_arms[1] * b_spin - row.normal_arms[0] * a_spin
+        bounce = jnp.where(speed < -_REST_SPEED, -rows.restitution * speed, 0.0)
+        touches = (normal > 0.0).astype(normal.dtype)
+        return _Demand(bounce, jnp.ones_like(normal), touches)
+
+    # An impact is found here as a rule: friction has to know of it.
+    return _swept(rows, eases, twists, impulses, demand, is_rubbing_last=True)
+
+
+class _Demand(NamedTuple):
+    """What is asked of a point's normal row."""
+
+    speed: FloatScalar
+    """At which surfaces part at least [m/s]."""
+    kept: FloatScalar
+    """Part of the impulse that is not given up."""
+    counts: FloatScalar
+    """One, or zero where nothing is asked."""
+
+
+def _swept(
+    rows: Rows, eases: tuple[Ease, Ease], twists, impulses, demand, *, is_rubbing_last
+):
+    """One pass over the four rows, both normals at once."""
+    nx, ny = rows.normal
+    a, b = eases
+    (ax, ay, a_spin), (bx, by, b_spin) = twists[0][:3], twists[1][:3]
+    dx, dy = bx - ax, by - ay
+    along, across = nx * dx + ny * dy, nx * dy - ny * dx
+    arms = [row.tangent_arms for row in rows.points]
+    arms += [row.normal_arms for row in rows.points]
+    gains = [row.gains[1] for row in rows.points]
+    gains += [row.gains[0] for row in rows.points]
+    direction = [(-ny, nx), (-ny, nx), (nx, ny), (nx, ny)]
+    if a.mixed is not None:
+        gains = [
+            gain_of(a, b, direction[i], arms[i], rows.points[i % 2].gains[0] > 0.0)
+            for i in range(4)
+        ]
+    speeds = [
+        (across if i < 2 else along) + arm[1] * b_spin - arm[0] * a_spin
+        for i, arm in enumerate(arms)
+    ]
+    totals = [impulse[1] for impulse in impulses] + [impulse[0] for impulse in impulses]
+    changes = [jnp.zeros_like(nx)] * 4
+
+    def change(i: int, new) -> None:
+        delta = new - totals[i]
+        totals[i], changes[i] = new, changes[i] + delta
+        for k in range(4):
+            speeds[k] = speeds[k] + _coupling(a, b, direction, arms, i, k) * delta
+
+    def rub() -> None:
+        for i in range(2):
+            limit = rows.friction * totals[2 + i]
+            new = totals[i] - gains[i] * speeds[i]
+            change(i, jnp.minimum(jnp.maximum(new, -limit), limit))
+
+    def press() -> None:
+        demands = [demand(row, totals[2 + i]) for i, row in enumerate(rows.points)]
+        new = _normals(
+            [g * d.counts for g, d in zip(gains[2:], demands, strict=True)],
+            _coupling(a, b, direction, arms, 2, 3),
+            [v - d.speed for v, d in zip(speeds[2:], demands, strict=True)],
+            totals[2:],
+            [d.kept for d in demands],
+        )
+        change(2, new[0])
+        change(3, new[1])
+
+    for stage in (press, rub) if is_rubbing_last else (rub, press):
+        stage()
+    pairs = [(changes[2], changes[0]), (changes[3], changes[1])]
+    out = []
+    for ease, twist, push in zip(eases, twists, pushes(rows, pairs), strict=True):
+        moved = [v + dv for v, dv in zip(twist, ease(push), strict=False)]
+        # The sums of impulses, where they are kept.
+        moved += [total + p for total, p in zip(twist[3:], push, strict=False)]
+        out.append(tuple(moved))
+    impulses = [
+        (old[0] + change[0], old[1] + change[1])
+        for old, change in zip(impulses, pairs, strict=True)
+    ]
+    return (out[0], out[1]), impulses
+
+
+def _normals(gains: list, coupling, lacking: list, before: list, kept: list) -> list:
+    """Both normal impulses, which meet their two demands exactly.
+
+    The linear complementarity problem of two unknowns has four cases; one after another
+    instead would turn a body that lands flat.
+    """
+    counts = [gain > 0.0 for gain in gains]
+    both = counts[0] & counts[1]
+    held = [jnp.where(on, v, 0.0) for on, v in zip(counts, before, strict=True)]
+    # What each would have to be if the other were none.
+    cross = jnp.where(both, coupling, 0.0)
+    alone = [held[i] + gains[i] * (cross * held[1 - i] - lacking[i]) for i in range(2)]
+    ratio = [gains[i] * cross for i in range(2)]
+    rest = 1.0 - ratio[0] * ratio[1]
+    can_share = both & (rest > 1e-4)
+    share = jnp.where(can_share, 1.0 / jnp.where(can_share, rest, 1.0), 0.0)
+    shared = [share * (alone[i] - ratio[i] * alone[1 - i]) for i in range(2)]
+    is_shared = can_share & (shared[0] >= 0.0) & (shared[1] >= 0.0)
+    single = [jnp.maximum(value, 0.0) for value in alone]
+    # With the first alone the second has enough.
+    is_first = (alone[1] <= ratio[1] * single[0]) | ~counts[1]
+    new = [
+        jnp.where(is_shared, shared[0], jnp.where(is_first, single[0], 0.0)),
+        jnp.where(is_shared, shared[1], jnp.where(is_first, 0.0, single[1])),
+    ]
+    return [jnp.where(counts[i], kept[i] * new[i], before[i]) for i in range(2)]
+
+
+def _coupling(a: Ease, b: Ease, direction, arms, j: int, i: int) -> FloatScalar:
+    """J_i A^-1 J_j^T: speed of row i per impulse of row j."""
+    if a.mixed is None:
+        total = arms[i][0] * arms[j][0] * a.spin + arms[i][1] * arms[j][1] * b.spin
+        # The normal and the tangent are orthogonal.
+        return total + (a.x + b.x) if (i < 2) == (j < 2) else total
+    total = jnp.zeros_like(arms[0][0])
+    for side, ease in ((0, a), (1, b)):
+        answer = ease((*direction[j], arms[j][side]))
+        push = (*direction[i], arms[i][side])
+        total = total + sum(p * q for p, q in zip(push, answer, strict=True))
+    return total
