@@ -88,19 +88,22 @@ def simulate(
         States before and after each row.
     """
     from boomdp_jax.physics import step
+    from boomdp_jax.physics.contact_rollout import empty_cache
 
-    def advance(state, row):
+    first = (initial_state, empty_cache(scene))
+
+    def advance(carry, row):
         action, point, dt, is_start = row
-        state = jax.tree.map(
-            lambda now, start: jnp.where(is_start, start, now), state, initial_state
+        state, cache = jax.tree.map(
+            lambda now, start: jnp.where(is_start, start, now), carry, first
         )
         wrench = action if point is None else _wrench_at_centre(action, point, state)
-        next_state, _ = step(scene, params, state, wrench, dt=dt)
-        return next_state, (state.array, next_state.array)
+        next_state, info = step(scene, params, state, wrench, dt=dt, cache=cache)
+        return (next_state, info.cache), (state.array, next_state.array)
 
     rows = (actions.action, actions.point, actions.dt, actions.is_start)
     rows = jax.tree.map(jnp.asarray, rows)
-    run_rows = jax.jit(lambda rows: jax.lax.scan(advance, initial_state, rows)[1])
+    run_rows = jax.jit(lambda rows: jax.lax.scan(advance, first, rows)[1])
     before, after = run_rows(rows)
     return np.asarray(before), np.asarray(after)
 

@@ -42,9 +42,12 @@ class _Program:
     static: tuple[Hashable, ...]
     treedef: Any
 
+    def tree(self, *leaves) -> Any:
+        """What the function returns."""
+        return self.function(*self.static, *jax.tree.unflatten(self.treedef, leaves))
+
     def __call__(self, *leaves) -> list:
-        tree = jax.tree.unflatten(self.treedef, leaves)
-        return jax.tree.leaves(self.function(*self.static, *tree))
+        return jax.tree.leaves(self.tree(*leaves))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,23 +116,36 @@ def in_lanes(
     leaves, treedef = jax.tree.flatten(arguments)
     leaves = [jnp.asarray(leaf)[..., None] for leaf in leaves]
     program = _Program(function, static, treedef)
-    shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves]
-    tree_out = jax.tree.structure(
-        jax.eval_shape(
-            lambda *flat: function(*static, *jax.tree.unflatten(treedef, flat)), *shapes
-        )
-    )
+    tree_out, _ = _results(program, _shapes_of(leaves), _is_double())
     out = _lanes_p.bind(*leaves, program=program)
     return jax.tree.unflatten(tree_out, [leaf[..., 0] for leaf in out])
 
 
+def _is_double() -> bool:
+    """Whether floats are double, which decides the type of what a trace writes."""
+    return jnp.result_type(float) == jnp.float64
+
+
+def _shapes_of(arrays) -> tuple:
+    """Shapes of one lane, and types."""
+    return tuple((array.shape[:-1], array.dtype) for array in arrays)
+
+
+@functools.lru_cache(maxsize=256)
+def _results(program, shapes: tuple, is_double: bool) -> tuple:
+    """Tree of the results, and their shapes of one lane, from one trace for all."""
+    del is_double  # A part of the key.
+    arguments = [jax.ShapeDtypeStruct((*shape, 1), dtype) for shape, dtype in shapes]
+    traced = getattr(program, "tree", program)
+    out, tree = jax.tree.flatten(jax.eval_shape(traced, *arguments))
+    return tree, _shapes_of(out)
+
+
 @_lanes_p.def_abstract_eval
-def _shapes(*avals, program):
-    shapes = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
-    return [
-        jax.core.ShapedArray(out.shape, out.dtype)
-        for out in jax.eval_shape(program, *shapes)
-    ]
+def _abstract(*avals, program):
+    _, out = _results(program, _shapes_of(avals), _is_double())
+    lanes = avals[0].shape[-1]
+    return [jax.core.ShapedArray((*shape, lanes), dtype) for shape, dtype in out]
 
 
 @functools.lru_cache(maxsize=256)

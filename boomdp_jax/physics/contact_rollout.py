@@ -42,6 +42,22 @@ def contact_step(
     return State(pose, twist), StepInfo(*reported, cache=impulses)
 
 
+def empty_cache(scene: Scene) -> Float[Array, "round pair 4"] | None:
+    """What `step` takes as `cache` where no step came before, in the form of others.
+
+    Args:
+        scene: outlines.
+
+    Returns:
+        Impulses of nothing; None for a scene without contact.
+    """
+    if scene.collides is None:
+        return None
+    num = scene.num_bodies
+    shape = (num_rounds(num), num_seats(num) // 2, 2 * NUM_POINTS)
+    return jnp.zeros(shape, scene.area.dtype)
+
+
 def contact_rollout(
     scene: Scene,
     params: Params,

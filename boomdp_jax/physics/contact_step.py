@@ -26,12 +26,7 @@ from boomdp_jax.physics.contact_impulses import part, settle
 from boomdp_jax.physics.contact_rows import Ease, Rows, Side, add_pushes, begin
 from boomdp_jax.physics.contact_world import ContactWorld, Fixed
 from boomdp_jax.physics.motion import Motion
-from boomdp_jax.physics.tournament import (
-    Halves,
-    moved_on,
-    seated,
-    unseated,
-)
+from boomdp_jax.physics.tournament import Halves, moved_on, num_seats, seated, unseated
 from boomdp_jax.physics.trigonometry import heading_turn
 
 NUM_POINTS = 2
@@ -143,14 +138,13 @@ def part_all(
     Returns:
         Twists and impulses.
     """
-    num_bodies, after = moved[0].shape[0], []
-    twists, moved = seated(twists, num_bodies), seated(moved, num_bodies)
-    rate = jnp.broadcast_to(rate[None], moved[0][0].shape)
-    for rows, ease, before in zip(contacts.rows, eases, impulses, strict=True):
-        twists, impulse = over_pairs(part, rows, ease, rate, moved, twists, before)
-        after.append(impulse)
-        twists, moved = moved_on(twists), moved_on(moved)
-    return unseated(twists, num_bodies), after
+    num_pairs = num_seats(twists[0].shape[0]) // 2
+    rates = jnp.broadcast_to(rate[None], (num_pairs, *rate.shape))
+
+    def one(rows, ease, *rest):
+        return over_pairs(part, rows, ease, rates, *rest)
+
+    return _sweep(one, contacts, eases, moved, twists, impulses)
 
 
 def settle_all(
@@ -172,12 +166,21 @@ def settle_all(
     Returns:
         Twists and impulses.
     """
+
+    def one(*pair):
+        return over_pairs(settle, *pair)
+
+    return _sweep(one, contacts, eases, before, twists, impulses)
+
+
+def _sweep(function, contacts, eases, given, twists, impulses):
+    """Round after round, with what of each body is given and what is changed."""
     num_bodies, after = twists[0].shape[0], []
-    twists, before = seated(twists, num_bodies), seated(before, num_bodies)
-    for rows, ease, impulse in zip(contacts.rows, eases, impulses, strict=True):
-        twists, impulse = over_pairs(settle, rows, ease, before, twists, impulse)
+    twists, given = seated(twists, num_bodies), seated(given, num_bodies)
+    for rows, ease, before in zip(contacts.rows, eases, impulses, strict=True):
+        twists, impulse = function(rows, ease, given, twists, before)
         after.append(impulse)
-        twists, before = moved_on(twists), moved_on(before)
+        twists, given = moved_on(twists), moved_on(given)
     return unseated(twists, num_bodies), after
 
 

@@ -4,14 +4,16 @@ All are functions of one world; the caller adds `vmap` over time or hypotheses. 
 bodies are left out: whatever holds them takes up any momentum, and they do no work.
 """
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar
-from boomdp_jax.physics.params import WORLD, Distance, Params, Revolute
+from boomdp_jax.physics.joints import joint_slots
+from boomdp_jax.physics.motion import motion_of
+from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
+from boomdp_jax.physics.step_info import joint_drift
 
 
 def mass_and_inertia(
@@ -145,32 +147,9 @@ def constraint_error(scene: Scene, params: Params, state: State) -> FloatScalar:
             f"Scene has {scene.num_bodies} bodies but the state {state.pose.shape[0]}; "
             "give the state of this scene."
         )
-    pin_gap, is_pin = _gaps(params.revolute, state)
-    rod_gap, is_rod = _gaps(params.distance, state)
-    errors = [
-        jnp.where(is_pin, pin_gap, 0.0),
-        jnp.where(is_rod, jnp.abs(rod_gap - params.distance.length), 0.0),
+    slots = [
+        slot
+        for joint in (params.revolute, params.distance)
+        for slot in joint_slots(joint, scene.num_bodies)
     ]
-    return jnp.max(jnp.concatenate(errors), initial=0.0)
-
-
-def _gaps(
-    joint: Revolute | Distance, state: State
-) -> tuple[Float[Array, " joint"], Bool[Array, " joint"]]:
-    """Distance between the anchors of every slot, and which slots are active."""
-
-    def anchor(body, local):
-        x, y, theta = state.pose[jnp.maximum(body, 0)]
-        cos, sin = jnp.cos(theta), jnp.sin(theta)
-        turned = jnp.stack(
-            [cos * local[0] - sin * local[1], sin * local[0] + cos * local[1]]
-        )
-        return jnp.where(body == WORLD, local, jnp.stack([x, y]) + turned)
-
-    def gap(body_a, body_b, anchor_a, anchor_b):
-        square = jnp.sum((anchor(body_a, anchor_a) - anchor(body_b, anchor_b)) ** 2)
-        is_open = square > 0
-        return jnp.where(is_open, jnp.sqrt(jnp.where(is_open, square, 1.0)), 0.0)
-
-    ends = (joint.body_a, joint.body_b, joint.anchor_a, joint.anchor_b)
-    return jax.vmap(gap)(*ends), joint.active
+    return joint_drift(slots, motion_of(state))

@@ -9,8 +9,6 @@ Process noise is a change of twist *before* the step, so that joints take up wha
 do not allow: a pinned body stays on its pin however hard it is shaken.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -18,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar, Key
+from boomdp_jax.physics.contact_rollout import empty_cache
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State, state_from_array
@@ -89,10 +88,8 @@ def _advance_all(scene, params, state, wrenches, shakes, dt) -> tuple[State, Ste
     """Step by step, each with a change of twist before it."""
     length = jnp.asarray(scene.dt if dt is None else dt, state.pose.dtype)
     is_constant = length.ndim == 0
-    constant, cache = None, None
-    if scene.collides is not None:
-        cache = _empty_cache(scene, params, state, wrenches[0])
-    elif is_constant:
+    constant = None
+    if scene.collides is None and is_constant:
         constant = prepare_step(scene, params, dt=length)
 
     def advance(carry, inputs):
@@ -113,10 +110,4 @@ def _advance_all(scene, params, state, wrenches, shakes, dt) -> tuple[State, Ste
     inputs = (wrenches, shakes, None if is_constant else length)
     # A reverse pass takes every step again, rather than to store all of its parts.
     one_step = jax.checkpoint(advance, prevent_cse=False)
-    return jax.lax.scan(one_step, (state, cache), inputs)[1]
-
-
-def _empty_cache(scene, params, state, wrench) -> Any:
-    """What a step takes that has none before it, in the form that steps return."""
-    _, info = jax.eval_shape(step, scene, params, state, wrench)
-    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), info.cache)
+    return jax.lax.scan(one_step, (state, empty_cache(scene)), inputs)[1]

@@ -6,7 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from boomdp_jax.physics.joints import Frames, joint_rows
+from boomdp_jax.core.arrays import FloatScalar
+from boomdp_jax.physics.joints import Frames, Slot, joint_rows
 from boomdp_jax.physics.motion import Motion
 from boomdp_jax.physics.prepare import Prepared
 from boomdp_jax.physics.trigonometry import sincos
@@ -39,14 +40,29 @@ def report(prepared: Prepared, motion: Motion) -> StepInfo:
     Returns:
         The report of a world without contact.
     """
+    total = jnp.sum(sum(motion))
+    return StepInfo(
+        constraint_error=joint_drift(prepared.slots, motion),
+        is_finite=jnp.isfinite(total),
+    )
+
+
+def joint_drift(slots: list[Slot], motion: Motion) -> FloatScalar:
+    """Largest distance by which an active joint fails to hold [m].
+
+    Args:
+        slots: pins and rods.
+        motion: where the bodies are.
+
+    Returns:
+        The distance; where it is exactly zero its derivative is taken to be zero.
+    """
     square = jnp.zeros((), motion.x.dtype)
-    if prepared.slots:
+    if slots:
         sin, cos = sincos(motion.theta)
         frames = Frames(motion.x, motion.y, cos, sin)
-        for slot in prepared.slots:
+        for slot in slots:
             drift = sum(row.error**2 for row in joint_rows([slot], frames))
             square = jnp.maximum(square, drift)
     has_error = square > 0
-    error = jnp.where(has_error, jnp.sqrt(jnp.where(has_error, square, 1.0)), 0.0)
-    total = jnp.sum(sum(motion))
-    return StepInfo(constraint_error=error, is_finite=jnp.isfinite(total))
+    return jnp.where(has_error, jnp.sqrt(jnp.where(has_error, square, 1.0)), 0.0)

@@ -7,6 +7,7 @@ from boomdp_jax.core.history import History
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.viz.posteriors import draw_posterior
 from boomdp_jax.viz.predictions import draw_prediction
+from boomdp_jax.viz.snapshots import new_figure
 from boomdp_jax.viz.structures import draw_structure_bars
 
 _MOST_BODIES = 4
@@ -34,20 +35,12 @@ def plot_posterior(
     Raises:
         ImportError: matplotlib is not installed.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError(
-            "matplotlib is not installed; pip install 'boomdp_jax[plot]'"
-        ) from error
     moving = [
         index for index, body in enumerate(posterior.spec.bodies) if not body.is_static
     ][:_MOST_BODIES]
     num_right = 1 if history is None else 2
     num_left = max(1, len(moving))
-    figure = Figure(
-        figsize=(4.6 * num_left + 5.2, 2.7 * num_right + 1.4), layout="constrained"
-    )
+    figure = new_figure((4.6 * num_left + 5.2, 2.7 * num_right + 1.4))
     grid = figure.add_gridspec(
         num_right, num_left + 1, width_ratios=[*[1.0] * num_left, 1.1]
     )

@@ -3,11 +3,13 @@
 import json
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from boomdp_jax.cli.main import main
 from boomdp_jax.core.history_file import load_transitions
+from boomdp_jax.physics import rollout
 from boomdp_jax.physics.scene_file import load_scene
 
 DENSITY, HALF_EXTENTS, DT = 10.0, (0.5, 0.3), 0.02
@@ -177,3 +179,22 @@ def test_a_motion_that_overflows_is_refused(
     assert main("simulate scene.json --actions a.npz --out out.npz".split()) == 2
     assert "body 'box': expected a motion that stays finite" in capsys.readouterr().err
     assert not Path("out.npz").exists()
+
+
+def test_bodies_in_contact_move_as_in_a_rollout(folder: Path):
+    scene = json.loads(Path("scene.json").read_text())
+    scene["gravity"] = [0, -9.81]
+    scene["bodies"][0] |= {"pose": [0, -0.1, 0], "contact": {"friction": 0.4}}
+    scene["bodies"][0]["shape"]["half_extents"] = [4, 0.1]
+    scene["bodies"][1] |= {"pose": [0, 0.3, 0], "twist": [1.0, 0.0, 0.0]}
+    Path("scene.json").write_text(json.dumps(scene))
+    action = _action(30, (0.0, 0.0, 0.0))
+    np.savez("a.npz", action=action)
+    _simulate()
+    spec = load_scene("scene.json")
+    table = load_transitions("out.npz", spec=spec)
+    states, _ = rollout(
+        spec.scene, spec.params(), spec.initial_state(), jnp.asarray(action)
+    )
+    np.testing.assert_allclose(table.next_state[..., :3], states.pose, atol=1e-9)
+    np.testing.assert_allclose(table.next_state[..., 3:], states.twist, atol=1e-9)
