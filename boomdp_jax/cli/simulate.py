@@ -88,7 +88,7 @@ def simulate(
         States before and after each row.
     """
     from boomdp_jax.physics import step
-    from boomdp_jax.physics.contact_rollout import empty_cache
+    from boomdp_jax.physics.world_rollout import empty_cache
 
     first = (initial_state, empty_cache(scene))
 

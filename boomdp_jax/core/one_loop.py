@@ -93,6 +93,37 @@ def one_loop(
     return jax.tree.unflatten(tree_out, _one_loop_p.bind(*flat, body=body))
 
 
+def elementwise(
+    function: Callable[..., Any], *arguments: Any, static: tuple[Hashable, ...] = ()
+) -> Any:
+    """Apply a function of scalars to arrays, element by element, as one loop.
+
+    Args:
+        function: as for `one_loop`.
+        arguments: trees of arrays; those of fewer axes are spread over leading ones.
+        static: what the function takes before its arguments, hashable.
+
+    Returns:
+        A tree of arrays of their common shape.
+    """
+    leaves, treedef = jax.tree.flatten(arguments)
+    dtype = jnp.result_type(*leaves)
+    leaves = [jnp.asarray(leaf, dtype) for leaf in leaves]
+    shape = jnp.broadcast_shapes(*(leaf.shape for leaf in leaves))
+
+    def apply(*scalars):
+        return one_loop(function, *jax.tree.unflatten(treedef, scalars), static=static)
+
+    for _ in shape:
+        apply = jax.vmap(apply)
+    # Leading axes are written out: rank promotion may be switched off.
+    leaves = [
+        leaf.reshape((1,) * (len(shape) - leaf.ndim) + leaf.shape) for leaf in leaves
+    ]
+    leaves = [jnp.broadcast_to(leaf, shape) for leaf in leaves]
+    return apply(*leaves)
+
+
 @functools.lru_cache(maxsize=256)
 def _traced(function, static, treedef, dtype, is_double):
     """The function as a body, and the tree of its results."""

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from boomdp_jax.inference.prior import PriorOptions
+from boomdp_jax.physics.constraint_spec import KINDS
 from boomdp_jax.physics.params import WORLD
 from boomdp_jax.physics.scene_spec import SceneSpec
 
@@ -76,7 +77,11 @@ def block_layout(spec: SceneSpec, bodies: tuple[int, ...]) -> Layout:
 
     Returns:
         The layout; its body indices count within the block.
+
+    Raises:
+        ValueError: the scene has a joint that inference cannot take along.
     """
+    _refuse_other_kinds(spec)
     place = {body: i for i, body in enumerate(bodies)}
     start = len(bodies)
     counts = {"revolute": 0, "distance": 0}
@@ -110,6 +115,19 @@ def block_layout(spec: SceneSpec, bodies: tuple[int, ...]) -> Layout:
             for i, j in itertools.combinations(movable, 2):
                 add(inferred, kind, i, j, -1)
     return Layout(len(bodies), tuple(inferred), tuple(known), start)
+
+
+def _refuse_other_kinds(spec: SceneSpec) -> None:
+    """Joints of which inference would otherwise take no notice."""
+    for index, constraint in enumerate(spec.constraints):
+        extras = sorted({"limit", "motor"} & constraint.numbers.keys())
+        if constraint.kind in KINDS and not extras:
+            continue
+        what = " with a ".join([constraint.kind, *extras])
+        raise ValueError(
+            f"{spec.source}: constraints[{index}]: inference expected one of "
+            f"{', '.join(KINDS)}, without limits and motors; got {what}"
+        )
 
 
 def structures(

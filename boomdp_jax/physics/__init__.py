@@ -10,8 +10,10 @@ from boomdp_jax.physics.params import WORLD as WORLD
 from boomdp_jax.physics.params import Distance as Distance
 from boomdp_jax.physics.params import Ground as Ground
 from boomdp_jax.physics.params import Params as Params
+from boomdp_jax.physics.params import Prismatic as Prismatic
 from boomdp_jax.physics.params import Revolute as Revolute
 from boomdp_jax.physics.params import Surface as Surface
+from boomdp_jax.physics.params import Weld as Weld
 from boomdp_jax.physics.params import Wheel as Wheel
 from boomdp_jax.physics.params import empty_params as empty_params
 from boomdp_jax.physics.quantities import angular_momentum as angular_momentum
@@ -21,6 +23,7 @@ from boomdp_jax.physics.quantities import linear_momentum as linear_momentum
 from boomdp_jax.physics.quantities import mass_and_inertia as mass_and_inertia
 from boomdp_jax.physics.quantities import potential_energy as potential_energy
 from boomdp_jax.physics.quantities import total_energy as total_energy
+from boomdp_jax.physics.removal import remove_bodies as remove_bodies
 from boomdp_jax.physics.scene import Scene as Scene
 from boomdp_jax.physics.scene_file import load_scene as load_scene
 from boomdp_jax.physics.scene_file import save_scene as save_scene
@@ -43,6 +46,7 @@ __all__ = [
     "FirstTime",
     "Ground",
     "Params",
+    "Prismatic",
     "Revolute",
     "Scene",
     "SceneSpec",
@@ -50,6 +54,7 @@ __all__ = [
     "State",
     "StepInfo",
     "Surface",
+    "Weld",
     "Wheel",
     "angular_momentum",
     "constraint_error",
@@ -66,6 +71,7 @@ __all__ = [
     "potential_energy",
     "prepare_step",
     "reached_region",
+    "remove_bodies",
     "rollout",
     "save_scene",
     "scene_spec_from_dict",

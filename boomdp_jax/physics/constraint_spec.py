@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from boomdp_jax.physics.body_spec import BodySpec
+from boomdp_jax.physics.friction import KNEE_SPEED
 from boomdp_jax.physics.params import WORLD
 from boomdp_jax.physics.scene_fields import (
     read_number,
@@ -17,18 +18,30 @@ from boomdp_jax.physics.scene_fields import (
 )
 
 KINDS = ("revolute", "distance", "wheel", "ground")
-"""Every kind of constraint, in the order of reports."""
+"""Every kind of constraint that can be inferred, in the order of reports."""
 
-KNEE_SPEED = 0.02
-"""Speed [m/s, rad/s for a joint] at which friction that is given by its dry limit alone
-reaches it: below, it is viscous. Larger: bodies creep on slopes and under small pushes;
-smaller: stiffer, with nothing to see for it at the resolution of a camera."""
+JOINTS = ("revolute", "distance", "prismatic", "weld")
+"""Kinds that have a partner."""
 
+KNOWN_KINDS = (*KINDS, "prismatic", "weld")
+"""Every kind of constraint that a scene file can tell of."""
+
+_ENDS = ("type", "a", "b", "anchor_a", "anchor_b")
+_RANGE = ("lower", "upper")
+_MOTOR_FIELDS = {
+    "revolute": ("motor_speed", "motor_torque"),
+    "prismatic": ("motor_speed", "motor_force"),
+}
 _FIELDS = {
-    "revolute": (("type", "a", "b", "anchor_a", "anchor_b"), ("viscous", "dry")),
-    "distance": (("type", "a", "b", "anchor_a", "anchor_b", "length"), ()),
+    "revolute": (_ENDS, ("viscous", "dry", *_RANGE, *_MOTOR_FIELDS["revolute"])),
+    "distance": ((*_ENDS, "length"), ()),
     "wheel": (("type", "a", "pose"), ("viscous", "dry")),
     "ground": (("type", "a"), ("viscous", "dry")),
+    "prismatic": (
+        (*_ENDS, "axis"),
+        ("angle", "viscous", "dry", *_RANGE, *_MOTOR_FIELDS["prismatic"]),
+    ),
+    "weld": (_ENDS, ("angle",)),
 }
 
 
@@ -38,9 +51,10 @@ class ConstraintSpec:
 
     `numbers` has the keys and units of the kind's class in `physics.params`, with
     anchors and wheel positions about the centre of mass; NaN is a number to be
-    inferred. `derived` names those that the file leaves out: the viscous coefficient
-    that follows from a dry limit, $c = d / v_k$ with `KNEE_SPEED` $v_k$ (for ground
-    $c = \mu m g / v_k$, so NaN until the mass is known), or an infinite dry limit.
+    inferred. `limit` and `motor` are there only if the file gives them. `derived`
+    names those that the file leaves out: the viscous coefficient that follows from a
+    dry limit, $c = d / v_k$ with `KNEE_SPEED` $v_k$ (for ground $c = \mu m g / v_k$,
+    so NaN until the mass is known), or an infinite dry limit.
     """
 
     kind: str
@@ -54,7 +68,7 @@ class ConstraintSpec:
     def is_known(self) -> bool:
         """Whether nothing about it is left to infer, but what follows from a mass."""
         return all(
-            np.all(np.isfinite(number) | np.isposinf(number))
+            not np.any(np.isnan(number))
             for key, number in self.numbers.items()
             if not (self.kind == "ground" and key in self.derived)
         )
@@ -80,14 +94,14 @@ def read_constraint(
     if not isinstance(value, dict):
         refuse(where, "an object", value)
     kind = value.get("type")
-    if not isinstance(kind, str) or kind not in KINDS:
-        refuse(f"{where}: type", f"one of {', '.join(KINDS)}", kind)
+    if not isinstance(kind, str) or kind not in KNOWN_KINDS:
+        refuse(f"{where}: type", f"one of {', '.join(KNOWN_KINDS)}", kind)
     required, optional = _FIELDS[kind]
     where = f"{where} ({kind})"
     fields = read_object(value, where, required=required, optional=optional)
     names = [body.name for body in bodies]
     body_a = _read_body_name(fields["a"], f"{where}: a", names)
-    if kind in ("revolute", "distance"):
+    if kind in JOINTS:
         body_b = _read_partner(fields["b"], f"{where}: b", names, body_a)
         numbers = _read_joint(fields, where, kind, bodies[body_a], body_b, bodies)
         is_static = body_b == WORLD or bodies[body_b].is_static
@@ -102,11 +116,13 @@ def read_constraint(
         numbers["position"] = pose[:2] - bodies[body_a].shift
         numbers["heading"] = pose[2]
     derived = frozenset()
-    if kind != "distance":
+    if kind not in ("distance", "weld"):
         friction, derived = _read_friction(
             fields, where, kind, bodies[body_a], normal_gravity
         )
         numbers |= friction
+    if kind in _MOTOR_FIELDS:
+        numbers |= _read_drive(fields, where, kind)
     numbers = {key: np.asarray(number, float) for key, number in numbers.items()}
     return ConstraintSpec(kind, body_a, body_b, numbers, derived)
 
@@ -126,7 +142,7 @@ def constraint_to_dict(
     a, b = constraint.body_a, constraint.body_b
     numbers = dict(constraint.numbers)
     entry: dict[str, object] = {"type": constraint.kind, "a": bodies[a].name}
-    if constraint.kind in ("revolute", "distance"):
+    if constraint.kind in JOINTS:
         entry["b"] = "world" if b == WORLD else bodies[b].name
         numbers["anchor_a"] = numbers["anchor_a"] + bodies[a].shift
         numbers["anchor_b"] = numbers["anchor_b"] + _shift(b, bodies)
@@ -134,7 +150,11 @@ def constraint_to_dict(
         position = numbers.pop("position") + bodies[a].shift
         numbers = {"pose": np.append(position, numbers.pop("heading")), **numbers}
     for key, number in numbers.items():
-        if key not in constraint.derived:
+        if key in ("limit", "motor"):
+            names = _RANGE if key == "limit" else _MOTOR_FIELDS[constraint.kind]
+            values = zip(names, number.tolist(), strict=True)
+            entry |= {name: value for name, value in values if math.isfinite(value)}
+        elif key not in constraint.derived:
             entry[key] = _with_nulls(number.tolist())
     return entry
 
@@ -189,9 +209,10 @@ def _read_joint(
     body_b: int,
     bodies: Sequence[BodySpec],
 ) -> dict[str, object]:
-    """Anchors about the centres of mass, and a rod's length."""
+    """Anchors about the centres of mass, and what else a kind holds."""
+    can_infer = kind in KINDS
     anchor_a, anchor_b = (
-        read_vector(fields[key], f"{where}: {key}", 2, is_nullable=True)
+        read_vector(fields[key], f"{where}: {key}", 2, is_nullable=can_infer)
         for key in ("anchor_a", "anchor_b")
     )
     numbers: dict[str, object] = {
@@ -202,6 +223,35 @@ def _read_joint(
         numbers["length"] = read_number(
             fields["length"], f"{where}: length", is_positive=True, is_nullable=True
         )
+    if kind == "prismatic":
+        numbers["axis"] = read_number(fields["axis"], f"{where}: axis")
+    if kind in ("prismatic", "weld"):
+        numbers["angle"] = read_number(fields.get("angle", 0.0), f"{where}: angle")
+    return numbers
+
+
+def _read_drive(fields: dict, where: str, kind: str) -> dict[str, object]:
+    """Range and motor of a joint, if there are any."""
+    numbers: dict[str, object] = {}
+    if any(key in fields for key in _RANGE):
+        lower, upper = (
+            read_number(fields[key], f"{where}: {key}") if key in fields else default
+            for key, default in zip(_RANGE, (-math.inf, math.inf), strict=True)
+        )
+        if lower > upper:
+            refuse(f"{where}: upper", f"a number of at least {lower:g} (lower)", upper)
+        numbers["limit"] = [lower, upper]
+    names = _MOTOR_FIELDS[kind]
+    given = [key in fields for key in names]
+    if any(given):
+        for key, is_there in zip(names, given, strict=True):
+            if not is_there:
+                refuse(where, f"a field {key!r} beside the motor's other", list(fields))
+        speed, strength = names
+        numbers["motor"] = [
+            read_number(fields[speed], f"{where}: {speed}"),
+            read_number(fields[strength], f"{where}: {strength}", least=0.0),
+        ]
     return numbers
 
 
@@ -220,7 +270,7 @@ def _read_friction(
             given[key] = np.asarray(
                 read_number(fields[key], f"{where}: {key}", least=0.0, is_nullable=True)
             )
-    if not given and kind != "revolute":
+    if not given and kind not in ("revolute", "prismatic"):
         refuse(where, "a field 'viscous' or 'dry' (null: to be inferred)", list(fields))
     derived = frozenset({"viscous", "dry"} - given.keys())
     if not given:

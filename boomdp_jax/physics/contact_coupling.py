@@ -15,10 +15,11 @@ vanishes from one substep to the next where forces last.
 All arrays of public functions are in lanes (`core.lanes`).
 """
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from boomdp_jax.core.one_loop import elementwise
+from boomdp_jax.physics.body_friction import BodyAnswer
 from boomdp_jax.physics.contact_rows import Ease
 from boomdp_jax.physics.contact_step import (
     Contacts,
@@ -28,17 +29,15 @@ from boomdp_jax.physics.contact_step import (
     settle_all,
 )
 from boomdp_jax.physics.contact_world import each_round
-from boomdp_jax.physics.general_step import to_world, velocity_problem
+from boomdp_jax.physics.general_step import projected, velocity_problem
+from boomdp_jax.physics.joints import Rows
 from boomdp_jax.physics.motion import Motion
+from boomdp_jax.physics.params import WORLD
 from boomdp_jax.physics.prepare import Prepared
-from boomdp_jax.physics.projection import project
-from boomdp_jax.physics.small_linear import dot3, inverse3, matvec3
+from boomdp_jax.physics.small_linear import dot3, matvec3
 from boomdp_jax.physics.velocity_solve import (
-    Solution,
     VelocityProblem,
-    damped_inertia,
     newton_step,
-    slopes_of,
     solve_velocity,
 )
 
@@ -48,9 +47,15 @@ _TINY_EASE = 1e-6
 
 def is_coupled(prepared: Prepared) -> bool:
     """Whether anything but contact can hold a body of this scene."""
-    parts = (prepared.contacts, prepared.spins)
-    joints = (prepared.slots, prepared.joint_spins)
-    return any(part is not None for part in parts) or any(joints)
+    joints = prepared.joints
+    holds = (
+        prepared.contacts,
+        prepared.spins,
+        joints.points,
+        joints.rods,
+        joints.angles,
+    )
+    return any(part is not None for part in holds)
 
 
 def coupled_substep(
@@ -77,30 +82,35 @@ def coupled_substep(
         The motion at the end, and what the next substep starts with.
     """
     num_bodies = motion.x.shape[0]
-    problem, turn = _along(velocity_problem)(prepared, motion, force)
-    solution = _along(solve_velocity)(problem)
-    free = to_world(solution.twist, *turn)
+    problem = velocity_problem(prepared, motion, force)
+    solved = solve_velocity(problem)
+    is_settled = solved.is_settled
     rate = 1.0 / prepared.length
-    before, sums, impulses = solution.twist, touch.sums, touch.impulses
-    ease = _along(_ease)(prepared, problem, solution, before, turn)
-    twists = tuple(v + dv for v, dv in zip(free, ease(sums), strict=True))
+    sums, impulses = touch.sums, touch.impulses
+    ease = _ease(problem, solved.answer)
+    twists = tuple(
+        v + dv for v, dv in zip(solved.solution.twist, ease(sums), strict=True)
+    )
 
-    def answer(twists, sums):
+    def answered(twists, sums, before):
         """Friction and joints under the impulses of contacts."""
-        base = _from_world(twists, *turn)
-        pushed = _pushed(problem, sums, *turn)
-        new = _along(newton_step)(pushed, Solution(base, solution.impulse), before)
-        return new, base
+        found = before.solution
+        guess = found._replace(twist=twists, before=found.twist)
+        return newton_step(_pushed(problem, sums), guess)
 
     for _ in range(num_sweeps):
-        eases = each_round(ease, num_bodies)
         both, impulses = part_all(
-            contacts, eases, rate, moved, (*twists, *sums), impulses
+            contacts,
+            each_round(ease, num_bodies),
+            rate,
+            moved,
+            (*twists, *sums),
+            impulses,
         )
         sums = both[3:]
-        solution, before = answer(both[:3], sums)
-        twists = to_world(solution.twist, *turn)
-        ease = _along(_ease)(prepared, problem, solution, before, turn)
+        solved = answered(both[:3], sums, solved)
+        twists = solved.solution.twist
+        ease = _ease(problem, solved.answer)
     place = moved_with(motion, _touches(sums), twists, prepared.length)
     both, impulses = settle_all(
         contacts,
@@ -110,68 +120,55 @@ def coupled_substep(
         impulses,
     )
     sums = both[3:]
-    solution, _ = answer(both[:3], sums)
-    final = Motion(*place, *to_world(solution.twist, *turn))
-    if prepared.slots:
-        final = _along(project)(prepared, final)
+    solved = answered(both[:3], sums, solved)
+    final = Motion(*place, *solved.solution.twist)
+    final = projected(prepared, problem, is_settled, force, motion, final)
     return final, Touch(impulses, sums)
-
-
-def _along(function):
-    """A function of one world, along lanes."""
-    return jax.vmap(function, in_axes=-1, out_axes=-1)
 
 
 def _touches(sums: tuple) -> Bool[Array, "body lane"]:
     return (sums[0] != 0.0) | (sums[1] != 0.0) | (sums[2] != 0.0)
 
 
-def _from_world(twist: tuple, cos, sin) -> tuple:
-    x, y, spin = twist
-    return cos * x + sin * y, cos * y - sin * x, spin
-
-
-def _pushed(problem: VelocityProblem, sums: tuple, cos, sin) -> VelocityProblem:
+def _pushed(problem: VelocityProblem, sums: tuple) -> VelocityProblem:
     """With the impulses of contacts among the momenta."""
-    push = _from_world(sums, cos, sin)
-    momentum = tuple(p + q for p, q in zip(problem.momentum, push, strict=True))
-    return problem._replace(momentum=momentum)
+    x, y, spin = (p + q for p, q in zip(problem.momentum, sums, strict=True))
+    return problem._replace(momentum=(x, y, spin))
 
 
-def _ease(
-    prepared: Prepared,
-    problem: VelocityProblem,
-    solution: Solution,
-    before: tuple,
-    turn: tuple,
-) -> Ease:
-    """What a body's friction and its pins to the world leave it to move, one world."""
-    k_contact, k_spin, _ = slopes_of(problem, solution.twist, before)
-    a = damped_inertia(problem, k_contact, k_spin)
-    a = [[0.5 * (a[i][j] + a[j][i]) for j in range(3)] for i in range(3)]
-    inverse = [[prepared.mobile * v for v in row] for row in inverse3(a)]
-    for row in problem.rows_mid:
-        if row.slot.a is None:
-            continue
-        held = row.slot.a * row.slot.is_world.astype(prepared.mass.dtype)
-        answer = matvec3(inverse, row.ja)
-        total = dot3(row.ja, answer)
-        is_held = total * prepared.mass > _TINY_EASE
-        share = jnp.where(is_held, held / jnp.where(is_held, total, 1.0), 0.0)
+def _ease(problem: VelocityProblem, answer: BodyAnswer) -> Ease:
+    """What a body's friction and its pins to the world leave it to move."""
+    rows, held = problem.rows_mid, []
+    if rows is not None:
+        for row in range(rows.a.shape[0]):
+            held.append(_of_row(rows, row, problem.mass.shape[0]))
+    return Ease(*elementwise(_left, problem.mass, answer, held))
+
+
+def _of_row(rows: Rows, row: int, num_bodies: int) -> tuple:
+    """Which bodies a row ties to the world, and how; `[body, lane]`."""
+    body = jnp.arange(num_bodies, dtype=rows.a.dtype)[:, None]
+    is_held = (rows.a[row][None] == body) & (rows.b[row][None] == WORLD)
+    return is_held.astype(rows.a.dtype), *(j[row][None] for j in rows.ja)
+
+
+def _left(mass, answer: BodyAnswer, held: list) -> tuple:
+    """Of one body in scalars."""
+    xy = xs = ys = jnp.zeros_like(mass)
+    if answer.mixed:
+        # Contacts take the answer to be symmetric, which it is to first order.
+        xy, xs, ys = (
+            0.5 * (answer.mixed[i] + answer.mixed[i + 1]) for i in range(0, 6, 2)
+        )
+    inverse = [[answer.xx, xy, xs], [xy, answer.yy, ys], [xs, ys, answer.spin]]
+    for is_held, *push in held:
+        given = matvec3(inverse, push)
+        total = dot3(push, given)
+        can_hold = total * mass > _TINY_EASE
+        share = jnp.where(can_hold, is_held / jnp.where(can_hold, total, 1.0), 0.0)
         inverse = [
-            [inverse[i][j] - answer[i] * answer[j] * share for j in range(3)]
+            [inverse[i][j] - given[i] * given[j] * share for j in range(3)]
             for i in range(3)
         ]
-    cos, sin = turn
-    (xx, xy, xs), (_, yy, ys), (_, _, ss) = inverse
-    cross = cos * sin * (xx - yy)
-    return Ease(
-        x=cos * cos * xx - 2.0 * cos * sin * xy + sin * sin * yy,
-        y=sin * sin * xx + 2.0 * cos * sin * xy + cos * cos * yy,
-        spin=ss,
-        mixed=(
-            cross + (cos * cos - sin * sin) * xy,
-            cos * xs - sin * ys,
-            sin * xs + cos * ys,
-        ),
-    )
+    (xx, xy, xs), (_, yy, ys), (_, _, spin) = inverse
+    return xx, yy, spin, (xy, xs, ys)

@@ -114,7 +114,10 @@ def _may_touch(scene: Scene, params: Params, prepared: Prepared):
     can_move = (prepared.mobile[:, None] + prepared.mobile[None]) > 0.0
     allowed = collides & can_move
     index = np.arange(num_bodies)
-    for joint in (params.revolute, params.distance):
+    joints = (params.revolute, params.distance, params.prismatic, params.weld)
+    for joint in joints:
+        if joint is None:
+            continue
         for slot in range(joint.active.shape[0]):
             is_a = joint.body_a[slot][None] == index[:, None]
             is_b = joint.body_b[slot][None] == index[:, None]

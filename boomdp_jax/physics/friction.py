@@ -30,6 +30,11 @@ from boomdp_jax.physics.trigonometry import sincos
 # four to 2e-4; after three, one in a thousand is wrong by 0.3 m/s.
 NUM_NEWTON = 5
 
+KNEE_SPEED = 0.02
+"""Speed [m/s, rad/s for a joint] at which friction that is given by its dry limit alone
+reaches it: below, it is viscous. Larger: bodies creep on slopes and under small pushes;
+smaller: stiffer, with nothing to see for it at the resolution of a camera."""
+
 PerContact = Float[Array, "*contact"]
 
 

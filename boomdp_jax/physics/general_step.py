@@ -1,19 +1,37 @@
 """A substep of a world of any number of bodies and joints, without contact.
 
-The stages are those of `step`. Numbers are arrays over bodies; every one that several
-others read is held, lest the compiler work it out again in each of them.
+The stages are those of `step`. All arrays are in lanes (`core.lanes`).
 """
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 from boomdp_jax.core.holding import hold, runtime_one
-from boomdp_jax.physics.joints import Frames, Row, joint_rows
+from boomdp_jax.core.one_loop import elementwise
+from boomdp_jax.physics.friction import Spin
+from boomdp_jax.physics.joints import (
+    Frames,
+    Rows,
+    bilateral_rows,
+    join_rows,
+    of_body,
+    slide_rows,
+    speed,
+    turn_rows,
+)
 from boomdp_jax.physics.motion import Motion
-from boomdp_jax.physics.prepare import Prepared
-from boomdp_jax.physics.projection import compliance_of, ease_between, project
-from boomdp_jax.physics.trigonometry import sincos
-from boomdp_jax.physics.velocity_solve import Twist, VelocityProblem, solve_velocity
+from boomdp_jax.physics.prepare import Drive, Prepared
+from boomdp_jax.physics.projection import ease_of, project
+from boomdp_jax.physics.trigonometry import rotated, sincos
+from boomdp_jax.physics.velocity_solve import (
+    Laws,
+    Limits,
+    VelocityProblem,
+    solve_velocity,
+)
 
 # Most that a row may change from mid-step to the end of a substep, squared and relative
 # in the metric of the masses: as much as a lever that turns by a quarter of a radian.
@@ -22,7 +40,7 @@ _MOST_CHANGE = 0.06
 
 def velocity_problem(
     prepared: Prepared, motion: Motion, force: tuple
-) -> tuple[VelocityProblem, tuple]:
+) -> VelocityProblem:
     """Set up the search for the twists at the end of a substep.
 
     Args:
@@ -31,9 +49,9 @@ def velocity_problem(
         force: world frame, at the centres of mass [N, N, N m].
 
     Returns:
-        The problem, and cosine and sine of the frames at mid-step.
+        The problem.
     """
-    h, mobile = prepared.length, prepared.mobile
+    h, mobile = prepared.length[None], prepared.mobile
     mass, inertia = prepared.mass, prepared.inertia
     vx, vy, spin = (mobile * v for v in motion[3:])
     one = runtime_one(mass)
@@ -41,67 +59,140 @@ def velocity_problem(
     def held(values):
         return jax.tree.map(lambda v: hold(v, one), values)
 
-    half_turn = 0.5 * h * spin
-    sin, cos = held(sincos(motion.theta + half_turn))
-    start = held((cos * vx + sin * vy, cos * vy - sin * vx, spin))
-    push_x = mobile * (h * force[0] + prepared.weight[0])
-    push_y = mobile * (h * force[1] + prepared.weight[1])
     momentum = held(
         (
-            mass * start[0] + cos * push_x + sin * push_y,
-            mass * start[1] + cos * push_y - sin * push_x,
+            mass * vx + mobile * (h * force[0] + prepared.weight[0]),
+            mass * vy + mobile * (h * force[1] + prepared.weight[1]),
             inertia * spin + mobile * h * force[2],
         )
     )
-    sin_half, cos_half = held(sincos(half_turn))
-    rows_mid, rows_end, compliance = [], [], []
-    if prepared.slots:
-        middle = Frames(motion.x + 0.5 * h * vx, motion.y + 0.5 * h * vy, cos, sin)
+    half_turn = 0.5 * h * spin
+    sin, cos = sincos(motion.theta + half_turn)
+    turn = rotated(None, half_turn)
+    cos, sin, turn = held((cos, sin, turn))
+    rows_end = ease = is_steady = None
+    x, y, theta = motion[:3]
+    middle = Frames(x + 0.5 * h * vx, y + 0.5 * h * vy, theta + half_turn, cos, sin)
+    middle = held(middle)
+    rows_mid = bilateral_rows(prepared.joints, middle)
+    if rows_mid is not None:
+        (tc, ts) = turn
         end = Frames(
-            motion.x + h * vx, motion.y + h * vy, cos, sin, (cos_half, sin_half)
+            x + h * vx,
+            y + h * vy,
+            theta + h * spin,
+            tc * cos - ts * sin,
+            tc * sin + ts * cos,
         )
-        rows_mid = joint_rows(prepared.slots, middle)
-        rows_end = [
-            _steadied(prepared, *rows)
-            for rows in zip(rows_mid, joint_rows(prepared.slots, end), strict=True)
-        ]
-        compliance = compliance_of(prepared, rows_mid)
-    problem = VelocityProblem(
+        rows_end = bilateral_rows(prepared.joints, held(end))
+        assert rows_end is not None
+        rows_end, is_steady = _steadied(prepared, rows_mid, rows_end)
+        ease = ease_of(prepared, rows_mid)
+    laws, limits = _drives(prepared, middle, (vx, vy, spin))
+    return VelocityProblem(
         mobile=mobile,
         mass=mass,
         inertia=inertia,
         momentum=momentum,
-        start=start,
-        turn=(cos_half, sin_half),
+        start=held((vx, vy, spin)),
+        frame=(cos, sin),
+        turn=turn,
         contacts=prepared.contacts,
         spins=prepared.spins,
         rows_mid=rows_mid,
         rows_end=rows_end,
-        compliance=compliance,
-        joint_spins=prepared.joint_spins,
+        ease=ease,
+        is_steady=is_steady,
+        laws=laws,
+        limits=limits,
     )
-    return problem, (cos, sin)
 
 
-def _steadied(prepared: Prepared, mid: Row, end: Row) -> Row:
-    """The row at the end of the substep, or at mid-step if it turns too far.
+def _steadied(
+    prepared: Prepared, mid: Rows, end: Rows
+) -> tuple[Rows, Bool[Array, " lane"]]:
+    """The rows at the end of the substep, or at mid-step where they turn too far.
+
+    And whether none does.
 
     Impulses act along one and joints hold along the other. As long as both are alike
     that is of second order; when they are not (a fast spin, a short rod) the system may
     be anything but positive, and give energy.
     """
-    at_mid, at_end = (ease_between(prepared, row, row) for row in (mid, end))
-    change = at_mid + at_end - 2.0 * ease_between(prepared, mid, end)
-    is_steady = change <= _MOST_CHANGE * at_mid
+    light, spinning = (
+        prepared.mobile / prepared.mass,
+        prepared.mobile / prepared.inertia,
+    )
+    ease_a, ease_b = (
+        (of_body(index, light), of_body(index, spinning)) for index in (mid.a, mid.b)
+    )
+    ja, jb, error, steady = elementwise(_steady, mid[2:], end[2:], ease_a, ease_b)
+    return Rows(mid.a, mid.b, ja, jb, error), jnp.all(steady > 0.0, axis=0)
+
+
+def _steady(mid: tuple, end: tuple, ease_a: tuple, ease_b: tuple) -> tuple:
+    """Of one row in scalars."""
+    (mid_a, mid_b, _), (end_a, end_b, error) = mid, end
+
+    def size(at_a, at_b):
+        total = 0.0
+        for (x, y, s), (light, spinning) in ((at_a, ease_a), (at_b, ease_b)):
+            total = total + (x * x + y * y) * light + s * s * spinning
+        return total
+
+    def change(p, q):
+        return tuple(v - u for u, v in zip(p, q, strict=True))
+
+    is_steady = size(change(mid_a, end_a), change(mid_b, end_b)) <= (
+        _MOST_CHANGE * size(mid_a, mid_b)
+    )
 
     def choose(yes, no):
-        return jnp.where(is_steady, yes, no)
+        return tuple(jnp.where(is_steady, v, u) for u, v in zip(no, yes, strict=True))
 
-    jb = None
-    if mid.jb is not None and end.jb is not None:
-        jb = tuple(choose(e, m) for e, m in zip(end.jb, mid.jb, strict=True))
-    ja = tuple(choose(e, m) for e, m in zip(end.ja, mid.ja, strict=True))
-    return end._replace(ja=ja, jb=jb)
+    steady = is_steady.astype(error.dtype)
+    return choose(end_a, mid_a), choose(end_b, mid_b), error, steady
+
+
+def _drives(
+    prepared: Prepared, middle: Frames, start: tuple
+) -> tuple[Laws | None, Limits | None]:
+    """What acts along the coordinates that joints leave free."""
+    laws, limits = [], []
+    for drive, rows_of in (
+        (prepared.turning, turn_rows),
+        (prepared.sliding, slide_rows),
+    ):
+        if drive is None:
+            continue
+        rows: Any = rows_of(prepared.joints, middle)
+        moving = speed(rows, start)
+        for spin, target in ((drive.friction, None), (drive.motor, drive.target)):
+            if spin is not None:
+                aim = jnp.zeros_like(moving) if target is None else target
+                laws.append(Laws(rows, Spin(*spin), moving, aim))
+        if drive.lower is not None:
+            limits.append(_range(prepared, drive, rows, moving))
+    return join_rows(*laws), join_rows(*limits)
+
+
+def _range(prepared: Prepared, drive: Drive, rows: Rows, moving) -> Limits:
+    """Speeds at which the ends of a range are met as the substep ends.
+
+    Where the range is left already (a projection puts that right) it is not left
+    further.
+    """
+    length = prepared.length[None]
+    # The error of these rows is the coordinate itself, at mid-step.
+    place = rows.error - 0.5 * length * moving
+    lower: Any = drive.lower
+    upper: Any = drive.upper
+    return Limits(
+        rows,
+        jnp.minimum((lower - place) / length, 0.0),
+        jnp.maximum((upper - place) / length, 0.0),
+        ease_of(prepared, rows),
+    )
 
 
 def general_substep(prepared: Prepared, motion: Motion, force: tuple) -> Motion:
@@ -115,34 +206,93 @@ def general_substep(prepared: Prepared, motion: Motion, force: tuple) -> Motion:
     Returns:
         The motion at the end.
     """
-    problem, (cos, sin) = velocity_problem(prepared, motion, force)
-    twist = held_twist(prepared, solve_velocity(problem).twist)
-    moved = moved_by(prepared, motion, to_world(twist, cos, sin))
-    return project(prepared, moved) if prepared.slots else moved
+    problem = velocity_problem(prepared, motion, force)
+    solved = solve_velocity(problem)
+    moved = moved_by(prepared, motion, solved.solution.twist)
+    return projected(prepared, problem, solved.is_settled, force, motion, moved)
 
 
-def held_twist(prepared: Prepared, twist: Twist) -> Twist:
-    """A twist that is worked out once."""
-    one = runtime_one(prepared.mass)
-    x, y, spin = (hold(v, one) for v in twist)
-    return x, y, spin
+def projected(
+    prepared: Prepared,
+    problem: VelocityProblem,
+    is_settled: Bool[Array, " lane"],
+    force: tuple,
+    start: Motion,
+    end: Motion,
+) -> Motion:
+    """The end of a substep on the joints, without energy that nothing brought.
 
+    Where bodies turn so far in a substep that the rows of their joints are not what
+    they were (`_steadied`), or come far off them, or where Newton's method has not come
+    to rest, a step is wrong whatever it does. Twists are then scaled down, which joints
+    do not notice, to the kinetic energy at the start and the work of forces and motors.
 
-def to_world(twist: Twist, cos, sin) -> Twist:
-    """From frames given by cosine and sine to the world's."""
-    x, y, spin = twist
-    return cos * x - sin * y, sin * x + cos * y, spin
+    Args:
+        prepared: what does not depend on the state.
+        problem: of this substep.
+        is_settled: whether that was solved.
+        force: world frame, at the centres of mass [N, N, N m].
+        start: of the substep.
+        end: of the substep, close to what joints allow.
 
+    Returns:
+        The end.
+    """
+    end, is_far = project(prepared, end)
+    is_right = is_settled & ~is_far
+    if problem.is_steady is not None:
+        is_right = is_right & problem.is_steady
+    half_mass = 0.5 * prepared.mobile * prepared.mass
+    half_inertia = 0.5 * prepared.mobile * prepared.inertia
 
-def moved_by(prepared: Prepared, motion: Motion, twist: Twist) -> Motion:
-    """Move with the mean of old and new twist."""
-    half, mobile = 0.5 * prepared.length, prepared.mobile
-    vx, vy, spin = (mobile * v for v in motion[3:])
-    one = runtime_one(prepared.mass)
-    moved = Motion(
-        motion.x + half * (vx + twist[0]),
-        motion.y + half * (vy + twist[1]),
-        motion.theta + half * (spin + twist[2]),
-        *twist,
+    def kinetic(motion: Motion):
+        linear = half_mass * (motion.vx**2 + motion.vy**2)
+        return jnp.sum(linear + half_inertia * motion.spin**2, axis=0)
+
+    length = prepared.length[None]
+    weight = [w / length for w in prepared.weight]
+    forces = (force[0] + weight[0], force[1] + weight[1], force[2])
+    work = sum(
+        jnp.sum(prepared.mobile * f * (new - old), axis=0)
+        for f, new, old in zip(forces, end[:3], start[:3], strict=True)
     )
-    return jax.tree.map(lambda v: hold(v, one), moved)
+    allowed = jnp.maximum(
+        kinetic(start) + work + _motor_work(prepared, problem, end), 0
+    )
+    present = kinetic(end)
+    is_much = ~is_right & (present > allowed)
+    ratio = allowed / jnp.where(is_much, present, 1.0)
+    # No derivative of the root of nothing.
+    has_ratio = is_much & (ratio > 0.0)
+    root = jnp.sqrt(jnp.where(has_ratio, ratio, 1.0))
+    scale = jnp.where(is_much, jnp.where(has_ratio, root, 0.0), 1.0)[None]
+    return end._replace(vx=scale * end.vx, vy=scale * end.vy, spin=scale * end.spin)
+
+
+def _motor_work(prepared: Prepared, problem: VelocityProblem, end: Motion):
+    """Most that motors can have done."""
+    laws = problem.laws
+    if laws is None:
+        return 0.0
+    drives = [d for d in (prepared.turning, prepared.sliding) if d is not None]
+    if all(drive.motor is None for drive in drives):
+        return 0.0
+    fastest = jnp.maximum(
+        jnp.abs(speed(laws.rows, tuple(end[3:]))), jnp.abs(laws.start)
+    )
+    # Viscous over knee is the largest impulse.
+    spin, has_motor = laws.friction, laws.target != 0.0
+    knee = jnp.where(spin.knee > 0.0, spin.knee, 1.0)
+    strength = jnp.where(has_motor & (spin.knee > 0.0), spin.viscous / knee, 0.0)
+    return jnp.sum(strength * fastest, axis=0)
+
+
+def moved_by(prepared: Prepared, motion: Motion, twist: tuple) -> Motion:
+    """Move with the mean of old and new twist."""
+    half, mobile = 0.5 * prepared.length[None], prepared.mobile
+    one = runtime_one(prepared.mass)
+    moved = [
+        place + half * (mobile * old + new)
+        for place, old, new in zip(motion[:3], motion[3:], twist, strict=True)
+    ]
+    return jax.tree.map(lambda v: hold(v, one), Motion(*moved, *twist))

@@ -1,185 +1,329 @@
-r"""Revolute and distance joints as rows of a linear constraint on twists.
+r"""Joints as rows of a linear constraint on twists.
 
-With $p_a = x_a + R_a \, r_a$ the anchor of body a and $p_b$ its partner's (a fixed
-point where the partner is the world):
+With $p_a = x_a + R_a r_a$ the anchor of body a and $p_b$ its partner's (a fixed point
+where the partner is the world), $d = p_a - p_b$, $r$ for $R r$ and $r^\perp$ for $r$
+turned by a right angle:
 
-- revolute: $C = p_a - p_b$, two rows; $\dot C = v_a + \omega_a r_a^\perp - v_b -
-  \omega_b r_b^\perp$, so $J = [\,I \;\; R_a r_a^\perp \mid -I \;\; -R_b r_b^\perp\,]$;
-- distance: $C = |p_a - p_b| - L$, one row, $J = d^T J_{revolute}$ with
-  $d = (p_a - p_b)/|p_a - p_b|$;
-- effective mass $K = J M^{-1} J^T$ for both.
+- coincident anchors (revolute, weld): $C = d$, two rows, $\dot C = v_a + \omega_a
+  r_a^\perp - v_b - \omega_b r_b^\perp$;
+- a fixed distance: $C = |d| - L$, one row, $J = d^T J_{coincident} / |d|$;
+- a fixed angle (weld, prismatic): $C = \theta_a - \theta_b - \alpha$, one row;
+- a guide (prismatic): $C = n \cdot d$ with $n$ across the axis, fixed in b; one row,
+  $\dot C = n \cdot (v_a + \omega_a r_a^\perp - v_b - \omega_b (r_b + d)^\perp)$.
 
-Rows are expressed in the frame of body a, where a pin to the world is constant.
+Along the coordinate that a joint leaves free (angle of a revolute, slide of a
+prismatic) the same form gives the row on which its friction, motor and limits act.
+
+All arrays are in lanes (`core.lanes`), twists and rows in world axes.
 """
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from boomdp_jax.core.arrays import FloatScalar
-from boomdp_jax.physics.params import WORLD, Distance, Revolute
-from boomdp_jax.physics.small_linear import dot3
+from boomdp_jax.core.one_loop import elementwise
+from boomdp_jax.physics.params import WORLD, Params
 
-Triple = tuple[FloatScalar, FloatScalar, FloatScalar]
+PerBody = Float[Array, "body lane"]
+PerSlot = Float[Array, "slot lane"]
+PerRow = Float[Array, "row lane"]
+Pair = tuple[PerSlot, PerSlot]
 # Below this separation of its anchors [m] a rod has no direction; it then acts along
 # no axis rather than along a random one.
 _TINY_LENGTH = 1e-9
+# Rows up to which a loop over them is written out.
+_FEW_ROWS = 6
 
 
 class Frames(NamedTuple):
-    """Where bodies are, and the frames in which their twists are expressed."""
+    """Where bodies are."""
 
-    x: Float[Array, " body"]
-    y: Float[Array, " body"]
-    cos: Float[Array, " body"]
-    """Of the frame in which twists are expressed."""
-    sin: Float[Array, " body"]
-    turn: tuple[Float[Array, " body"], Float[Array, " body"]] | None = None
-    """Cosine and sine of the body's orientation relative to that frame; None: equal."""
+    x: PerBody
+    y: PerBody
+    theta: PerBody
+    cos: PerBody
+    sin: PerBody
 
 
-class Slot(NamedTuple):
-    """One joint slot in scalars, taken out of its arrays before the time loop."""
+class Ends(NamedTuple):
+    """What the slots of a kind tie together."""
 
-    active: FloatScalar
-    a: Float[Array, " body"] | None
-    """Weight of each body as partner a; None in a scene of one body."""
-    b: Float[Array, " body"] | None
-    is_world: Bool[Array, ""]
-    anchor_a: tuple[FloatScalar, FloatScalar]
-    anchor_b: tuple[FloatScalar, FloatScalar]
-    length: FloatScalar | None
-    """Rest length [m]; None for a pin."""
+    on: PerSlot
+    """One where a slot is active, else zero."""
+    has_b: PerSlot
+    """Likewise, and zero too where the partner is the world."""
+    a: PerSlot
+    """Index of the body."""
+    b: PerSlot
+    """Index of the partner; `WORLD` for the world."""
+    anchor_a: Pair
+    anchor_b: Pair
 
 
-class Row(NamedTuple):
-    """One scalar constraint: J_a w_a + J_b w_b = 0."""
+class Joints(NamedTuple):
+    """Slots by what they hold; None where there are none."""
 
-    slot: Slot
-    ja: Triple
-    jb: Triple | None
-    """None where no partner can exist (a scene of one body)."""
-    error: FloatScalar
-    """C itself [m]."""
+    points: Ends | None
+    """Coincident anchors: revolute, then weld."""
+    rods: Ends | None
+    length: PerSlot | None
+    """Of the rods [m]."""
+    angles: Ends | None
+    """Fixed angles: weld, then prismatic."""
+    angle: PerSlot | None
+    """Of these [rad]."""
+    guides: Ends | None
+    """Prismatic."""
+    axis: Pair | None
+    """Of the guides: cosine and sine in the partner's frame."""
+    turns: Ends | None
+    """Revolute, for what acts on their angle."""
 
-    def velocity(self, w) -> FloatScalar:
-        """J w of a twist."""
-        total = dot3(self.ja, tuple(select(self.slot.a, v) for v in w))
-        if self.jb is not None:
-            total = total + dot3(self.jb, tuple(select(self.slot.b, v) for v in w))
-        return total
 
-    def push(self) -> tuple:
-        """J^T over bodies."""
-        out = tuple(scatter(self.slot.a, j) for j in self.ja)
-        if self.jb is None:
-            return out
-        return tuple(
-            o + scatter(self.slot.b, j) for o, j in zip(out, self.jb, strict=True)
+class Rows(NamedTuple):
+    """Scalar constraints J_a w_a + J_b w_b = 0; zeros for an inactive slot."""
+
+    a: PerRow
+    b: PerRow
+    ja: tuple[PerRow, PerRow, PerRow]
+    jb: tuple[PerRow, PerRow, PerRow]
+    error: PerRow
+    """C itself [m, rad]."""
+
+
+def joints_of(params: Params, dtype) -> Joints:
+    """All slots of a hypothesis, in lanes."""
+
+    def ends(joint) -> Ends | None:
+        if joint is None or joint.active.shape[0] == 0:
+            return None
+        on = joint.active.astype(dtype)
+        return Ends(
+            on=on,
+            has_b=jnp.where(joint.body_b == WORLD, 0.0, on),
+            a=joint.body_a.astype(dtype),
+            b=joint.body_b.astype(dtype),
+            anchor_a=(joint.anchor_a[:, 0], joint.anchor_a[:, 1]),
+            anchor_b=(joint.anchor_b[:, 0], joint.anchor_b[:, 1]),
         )
 
-
-def joint_slots(joint: Revolute | Distance, num_bodies: int) -> list[Slot]:
-    """Every slot of one kind, in scalars."""
-    dtype = joint.anchor_a.dtype
-    body = jnp.arange(num_bodies)
-    slots = []
-    for slot in range(joint.active.shape[0]):
-        is_alone = num_bodies == 1
-        slots.append(
-            Slot(
-                active=joint.active[slot].astype(dtype),
-                a=None if is_alone else (body == joint.body_a[slot]).astype(dtype),
-                b=None if is_alone else (body == joint.body_b[slot]).astype(dtype),
-                is_world=joint.body_b[slot] == WORLD,
-                anchor_a=(joint.anchor_a[slot, 0], joint.anchor_a[slot, 1]),
-                anchor_b=(joint.anchor_b[slot, 0], joint.anchor_b[slot, 1]),
-                length=joint.length[slot] if isinstance(joint, Distance) else None,
-            )
-        )
-    return slots
-
-
-def select(weights: Float[Array, " body"] | None, values: Float[Array, "..."]):
-    """The value of one body."""
-    return values if weights is None else jnp.sum(weights * values)
-
-
-def scatter(weights: Float[Array, " body"] | None, value: FloatScalar):
-    """The value placed at one body, zero elsewhere."""
-    return value if weights is None else weights * value
-
-
-def _anchor(frames: Frames, weights, anchor):
-    """Anchor in the frame of its body's twist."""
-    if frames.turn is None:
-        return anchor
-    cos, sin = (select(weights, part) for part in frames.turn)
-    return cos * anchor[0] - sin * anchor[1], sin * anchor[0] + cos * anchor[1]
-
-
-def _pin_rows(slot: Slot, frames: Frames) -> tuple[Row, Row]:
-    """The two rows of a coincidence of anchors, in the frame of body a."""
-    on = slot.active
-    ax, ay = _anchor(frames, slot.a, slot.anchor_a)
-    ca, sa = select(slot.a, frames.cos), select(slot.a, frames.sin)
-    xa, ya = select(slot.a, frames.x), select(slot.a, frames.y)
-    bx, by = slot.anchor_b
-    jb = (None, None)
-    if slot.b is not None:
-        has_b = jnp.where(slot.is_world, 0.0, on)
-        lx, ly = _anchor(frames, slot.b, slot.anchor_b)
-        cb, sb = select(slot.b, frames.cos), select(slot.b, frames.sin)
-        # From b's frame to a's.
-        c, s = ca * cb + sa * sb, ca * sb - sa * cb
-        rx, ry = c * lx - s * ly, s * lx + c * ly
-        bx = jnp.where(slot.is_world, bx, select(slot.b, frames.x) + cb * lx - sb * ly)
-        by = jnp.where(slot.is_world, by, select(slot.b, frames.y) + sb * lx + cb * ly)
-        jb = (
-            (-has_b * c, has_b * s, has_b * ry),
-            (-has_b * s, -has_b * c, -has_b * rx),
-        )
-    dx, dy = xa - bx, ya - by
-    zero = jnp.zeros_like(on)
-    return (
-        Row(slot, (on, zero, -on * ay), jb[0], on * (ca * dx + sa * dy + ax)),
-        Row(slot, (zero, on, on * ax), jb[1], on * (ca * dy - sa * dx + ay)),
+    pins, rods = ends(params.revolute), ends(params.distance)
+    welds, guides = ends(params.weld), ends(params.prismatic)
+    angle, axis = [], None
+    if params.weld is not None and welds is not None:
+        angle.append(params.weld.angle)
+    if params.prismatic is not None and guides is not None:
+        angle.append(params.prismatic.angle)
+        axis = (jnp.cos(params.prismatic.axis), jnp.sin(params.prismatic.axis))
+    return Joints(
+        points=_joined(pins, welds),
+        rods=rods,
+        length=None if rods is None else params.distance.length,
+        angles=_joined(welds, guides),
+        angle=jnp.concatenate(angle) if angle else None,
+        guides=guides,
+        axis=axis,
+        turns=pins,
     )
 
 
-def _rod_row(slot: Slot, frames: Frames) -> Row:
-    """The row of a fixed distance."""
-    row_x, row_y = _pin_rows(slot, frames)
-    square = row_x.error**2 + row_y.error**2
-    has_length = square > _TINY_LENGTH**2
-    separation = jnp.sqrt(jnp.where(has_length, square, 1.0))
-    dx = jnp.where(has_length, row_x.error / separation, 0.0)
-    dy = jnp.where(has_length, row_y.error / separation, 0.0)
-
-    def along(x, y):
-        return tuple(dx * p + dy * q for p, q in zip(x, y, strict=True))
-
-    jb = None if row_x.jb is None else along(row_x.jb, row_y.jb)
-    rest: Any = slot.length
-    length = jnp.where(has_length, separation, 0.0) - rest
-    return Row(slot, along(row_x.ja, row_y.ja), jb, slot.active * length)
+def _joined(*parts: Any) -> Any:
+    """One after another along the first axis, of those that are there."""
+    parts = tuple(part for part in parts if part is not None)
+    if not parts:
+        return None
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
-def joint_rows(slots: list[Slot], frames: Frames) -> list[Row]:
-    """All rows of all slots: two of a pin, one of a rod.
+join_rows = _joined
+
+
+def of_body(index: PerRow, values: Any) -> Any:
+    """What one body has, in each row; zero for the world.
 
     Args:
-        slots: pins and rods.
+        index: of the body.
+        values: tree of arrays `[body, lane]`.
+
+    Returns:
+        Tree of arrays `[row, lane]`.
+    """
+    leaves, treedef = jax.tree.flatten(values)
+    # Stacked, which makes one operation of each body's instead of many.
+    table = jnp.stack(leaves, axis=1)
+    total = jnp.zeros((len(leaves), *index.shape), table.dtype)
+    for body in range(table.shape[0]):
+        total = jnp.where((index == body)[None], table[body][:, None], total)
+    return jax.tree.unflatten(treedef, list(total))
+
+
+def to_bodies(rows: "Rows", pushes: tuple, values: tuple) -> tuple:
+    """Add to each body what all rows bring to it.
+
+    Args:
+        rows: which bodies they tie.
+        pushes: what each brings to its first and to its second body, three numbers.
+        values: three numbers of every body.
+
+    Returns:
+        The values afterwards.
+    """
+    num_bodies, lanes = values[0].shape
+    body = jnp.arange(num_bodies, dtype=rows.a.dtype)[:, None]
+    table = jnp.stack(
+        [rows.a, *pushes[0], rows.b, *pushes[1]], axis=1
+    )  # One row of it is what one turn of the loop needs.
+
+    def add(row, totals):
+        a, *to_a = jax.lax.dynamic_index_in_dim(table, row, keepdims=False)[:4]
+        b, *to_b = jax.lax.dynamic_index_in_dim(table, row, keepdims=False)[4:]
+        return tuple(
+            total
+            + jnp.where(a[None] == body, p[None], 0.0)
+            + jnp.where(b[None] == body, q[None], 0.0)
+            for total, p, q in zip(totals, to_a, to_b, strict=True)
+        )
+
+    first = tuple(jnp.broadcast_to(v, (num_bodies, lanes)) for v in values)
+    num = table.shape[0]
+    if num <= _FEW_ROWS:
+        for row in range(num):
+            first = add(row, first)
+        return first
+    return jax.lax.fori_loop(0, num, add, first)
+
+
+def speed(rows: Rows, twist: tuple) -> PerRow:
+    """J w."""
+    return sum(
+        j * v
+        for index, push in ((rows.a, rows.ja), (rows.b, rows.jb))
+        for j, v in zip(push, of_body(index, tuple(twist)), strict=True)
+    )
+
+
+def bilateral_rows(joints: Joints, frames: Frames) -> Rows | None:
+    """All rows that hold in both directions.
+
+    Args:
+        joints: the slots.
         frames: where the bodies are.
 
     Returns:
-        The rows; those of an inactive slot are zero.
+        The rows: both of coincident anchors, rods, angles, guides; None if there is no
+        slot.
     """
-    rows = []
-    for slot in slots:
-        if slot.length is None:
-            rows += _pin_rows(slot, frames)
-        else:
-            rows.append(_rod_row(slot, frames))
-    return rows
+    parts = []
+    for ends, function, more in (
+        (joints.points, _point, ()),
+        (joints.rods, _rod, (joints.length,)),
+        (joints.angles, _angle, (joints.angle,)),
+        (joints.guides, _guide, (joints.axis,)),
+    ):
+        if ends is None:
+            continue
+        found = elementwise(function, _placed(ends, frames), *more)
+        parts += [Rows(ends.a, ends.b, *row) for row in found]
+    return _joined(*parts)
+
+
+def turn_rows(joints: Joints, frames: Frames) -> Rows | None:
+    """The angle of every revolute, with the angle for an error."""
+    if joints.turns is None:
+        return None
+    placed = _placed(joints.turns, frames)
+    ((*row,),) = elementwise(_angle, placed, jnp.zeros_like(joints.turns.on))
+    return Rows(joints.turns.a, joints.turns.b, *row)
+
+
+def slide_rows(joints: Joints, frames: Frames) -> Rows | None:
+    """The slide of every prismatic, with the slide for an error."""
+    if joints.guides is None:
+        return None
+    placed = _placed(joints.guides, frames)
+    ((*row,),) = elementwise(_slide, placed, joints.axis)
+    return Rows(joints.guides.a, joints.guides.b, *row)
+
+
+class _Placed(NamedTuple):
+    """A slot and where its bodies are, in scalars; zeros for the world."""
+
+    ends: Ends
+    pose_a: Frames
+    pose_b: Frames
+
+
+def _placed(ends: Ends, frames: Frames) -> _Placed:
+    return _Placed(
+        ends,
+        of_body(ends.a, frames),
+        of_body(ends.b, frames),
+    )
+
+
+def _arms(slot: _Placed) -> tuple:
+    """Anchors about the centres of mass, and from b's to a's; world axes."""
+    (on, has_b, _, b, (ax, ay), (bx, by)), p, q = slot
+    is_world = b == WORLD
+    rx, ry = p.cos * ax - p.sin * ay, p.sin * ax + p.cos * ay
+    sx = jnp.where(is_world, bx, q.cos * bx - q.sin * by)
+    sy = jnp.where(is_world, by, q.sin * bx + q.cos * by)
+    return on, has_b, (rx, ry), (sx, sy), (p.x + rx - q.x - sx, p.y + ry - q.y - sy)
+
+
+def _along(on, has_b, direction: tuple, arm_a: tuple, arm_b: tuple, error) -> tuple:
+    """The row of a motion along a direction."""
+    dx, dy = direction
+    ja = (on * dx, on * dy, on * (arm_a[0] * dy - arm_a[1] * dx))
+    jb = (-has_b * dx, -has_b * dy, -has_b * (arm_b[0] * dy - arm_b[1] * dx))
+    return ja, jb, on * error
+
+
+def _point(slot: _Placed) -> tuple:
+    on, has_b, arm_a, arm_b, gap = _arms(slot)
+    one, zero = jnp.ones_like(on), jnp.zeros_like(on)
+    return (
+        _along(on, has_b, (one, zero), arm_a, arm_b, gap[0]),
+        _along(on, has_b, (zero, one), arm_a, arm_b, gap[1]),
+    )
+
+
+def _rod(slot: _Placed, length) -> tuple:
+    on, has_b, arm_a, arm_b, (dx, dy) = _arms(slot)
+    square = dx * dx + dy * dy
+    has_length = square > _TINY_LENGTH**2
+    distance = jnp.sqrt(jnp.where(has_length, square, 1.0))
+    share = jnp.where(has_length, 1.0 / distance, 0.0)
+    error = jnp.where(has_length, distance, 0.0) - length
+    return (_along(on, has_b, (share * dx, share * dy), arm_a, arm_b, error),)
+
+
+def _angle(slot: _Placed, angle) -> tuple:
+    on, has_b = slot.ends.on, slot.ends.has_b
+    zero = jnp.zeros_like(on)
+    error = on * (slot.pose_a.theta - slot.pose_b.theta - angle)
+    return (((zero, zero, on), (zero, zero, -has_b), error),)
+
+
+def _axis(slot: _Placed, axis: tuple) -> tuple:
+    """The guide's axis in the world."""
+    q = slot.pose_b
+    is_world = slot.ends.b == WORLD
+    c, s = jnp.where(is_world, 1.0, q.cos), jnp.where(is_world, 0.0, q.sin)
+    return c * axis[0] - s * axis[1], s * axis[0] + c * axis[1]
+
+
+def _guide(slot: _Placed, axis: tuple) -> tuple:
+    on, has_b, arm_a, arm_b, (dx, dy) = _arms(slot)
+    tx, ty = _axis(slot, axis)
+    whole = (arm_b[0] + dx, arm_b[1] + dy)
+    return (_along(on, has_b, (-ty, tx), arm_a, whole, tx * dy - ty * dx),)
+
+
+def _slide(slot: _Placed, axis: tuple) -> tuple:
+    on, has_b, arm_a, arm_b, (dx, dy) = _arms(slot)
+    tx, ty = _axis(slot, axis)
+    whole = (arm_b[0] + dx, arm_b[1] + dy)
+    return (_along(on, has_b, (tx, ty), arm_a, whole, tx * dx + ty * dy),)

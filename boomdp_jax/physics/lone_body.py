@@ -29,10 +29,18 @@ from boomdp_jax.core.arrays import FloatScalar
 from boomdp_jax.core.holding import hold, runtime_one
 from boomdp_jax.physics.friction import Contact, Spin
 from boomdp_jax.physics.implicit_fit import Groups
-from boomdp_jax.physics.joints import Slot
 from boomdp_jax.physics.lone_contacts import Feet, Pair, Track, into, turned
 from boomdp_jax.physics.lone_friction import Brake, Stuck
 from boomdp_jax.physics.lone_wheel import Grip, grip
+
+
+class Pin(NamedTuple):
+    """A revolute slot of a lone body, which pins it to the world."""
+
+    active: FloatScalar
+    """One or zero."""
+    anchor_a: Pair
+    anchor_b: Pair
 
 
 class Pivot(NamedTuple):
@@ -86,7 +94,7 @@ def lone_body(
     groups: Groups,
     facing: FloatScalar,
     spins: Spin | None,
-    pins: list[Slot],
+    pins: list[Pin],
 ) -> LoneBody:
     """Prepare a body for its time loop.
 

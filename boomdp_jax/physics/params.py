@@ -25,6 +25,12 @@ class Revolute(eqx.Module):
     """Joint friction torque per relative spin [N m s/rad]."""
     dry: Float[Array, "*batch joint"]
     """Largest joint friction torque [N m]; infinite for purely viscous friction."""
+    limit: Float[Array, "*batch joint 2"] | None = None
+    """Least and largest theta_a - theta_b (the world's is zero, angles are not wrapped)
+    [rad]; infinite where there is none. None: of no joint."""
+    motor: Float[Array, "*batch joint 2"] | None = None
+    """Relative spin that a motor drives at [rad/s] and its largest torque [N m]; a
+    torque of zero is no motor. None: of no joint."""
 
 
 class Distance(eqx.Module):
@@ -37,6 +43,42 @@ class Distance(eqx.Module):
     anchor_b: Float[Array, "*batch joint 2"]
     length: Float[Array, "*batch joint"]
     """Rest length [m]."""
+
+
+class Weld(eqx.Module):
+    """Two bodies, or one and the world, as one: anchors coincide and turn together."""
+
+    active: Bool[Array, "*batch joint"]
+    body_a: Int[Array, "*batch joint"]
+    body_b: Int[Array, "*batch joint"]
+    anchor_a: Float[Array, "*batch joint 2"]
+    anchor_b: Float[Array, "*batch joint 2"]
+    angle: Float[Array, "*batch joint"]
+    """theta_a - theta_b [rad]."""
+
+
+class Prismatic(eqx.Module):
+    """Drawers: an anchor of `a` slides along a line fixed in `b`, without turning."""
+
+    active: Bool[Array, "*batch joint"]
+    body_a: Int[Array, "*batch joint"]
+    body_b: Int[Array, "*batch joint"]
+    anchor_a: Float[Array, "*batch joint 2"]
+    anchor_b: Float[Array, "*batch joint 2"]
+    """A point of the line, from which the slide counts."""
+    axis: Float[Array, "*batch joint"]
+    """Direction of the line, in the frame of `b` or of the world [rad]."""
+    angle: Float[Array, "*batch joint"]
+    """theta_a - theta_b [rad]."""
+    viscous: Float[Array, "*batch joint"]
+    """Friction force per speed of the slide [N s/m]."""
+    dry: Float[Array, "*batch joint"]
+    """Largest friction force [N]; infinite for purely viscous friction."""
+    limit: Float[Array, "*batch joint 2"] | None = None
+    """Least and largest slide [m]; infinite where there is none. None: of no joint."""
+    motor: Float[Array, "*batch joint 2"] | None = None
+    """Speed that a motor drives at [m/s] and its largest force [N]; a force of zero is
+    no motor. None: of no joint."""
 
 
 class Wheel(eqx.Module):
@@ -93,6 +135,8 @@ class Params(eqx.Module):
     ground: Ground
     surface: Surface | None = None
     """What contact is like; needed in scenes with contact (`Scene.collides`)."""
+    prismatic: Prismatic | None = None
+    weld: Weld | None = None
 
 
 def empty_params(

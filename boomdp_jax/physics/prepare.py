@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from boomdp_jax.core.arrays import FloatScalar
 from boomdp_jax.core.holding import hold, runtime_one
 from boomdp_jax.physics.friction import (
+    KNEE_SPEED,
     Contact,
     Spin,
     friction_points,
@@ -16,13 +17,14 @@ from boomdp_jax.physics.friction import (
     wheel_headings,
 )
 from boomdp_jax.physics.implicit_fit import (
+    Groups,
     contact_groups,
     fit_weights,
     implicit_weight,
 )
-from boomdp_jax.physics.joints import Slot, joint_slots, select
-from boomdp_jax.physics.lone_body import LoneBody, lone_body
-from boomdp_jax.physics.params import Params
+from boomdp_jax.physics.joints import Ends, Joints, joints_of, of_body
+from boomdp_jax.physics.lone_body import LoneBody, Pin, lone_body
+from boomdp_jax.physics.params import Params, Prismatic, Revolute
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.small_linear import dot3, matvec3
 
@@ -30,24 +32,159 @@ MOST_LONE_CONTACTS = 16
 """Contacts of a lone body that are written out one by one: above, the general solver,
 which stacks them, compiles faster."""
 
+_FAR = 1e9
+"""A limit that is never met [rad, m]."""
 
-class Prepared(NamedTuple):
-    """What depends on scene, params and step length alone, out of the time loop."""
+
+class Bodies(NamedTuple):
+    """Masses and frictions of bodies, in frames of their own.
+
+    Without the body axis in a scene of one body.
+    """
 
     length: FloatScalar
-    mobile: Float[Array, " body"]
-    mass: Float[Array, " body"]
-    inertia: Float[Array, " body"]
-    weight: tuple[Float[Array, " body"], Float[Array, " body"]]
+    """Of a substep [s]."""
+    mobile: Float[Array, "*body"]
+    """One, or zero for a static body."""
+    mass: Float[Array, "*body"]
+    inertia: Float[Array, "*body"]
+    weight: tuple[Float[Array, "*body"], Float[Array, "*body"]]
+    """Impulse of gravity over a substep [N s]."""
     contacts: Contact | None
     spins: Spin | None
-    slots: list[Slot]
-    """Pins, then rods."""
-    joint_spins: list[tuple[Slot, Spin]]
 
 
-def prepare(scene: Scene, params: Params, length: FloatScalar) -> Prepared | LoneBody:
-    """Masses, frictions with impulses in place of forces, and their blend weights."""
+class Drive(NamedTuple):
+    """What acts along the coordinates that slots of a kind leave free."""
+
+    friction: Spin | None
+    """Impulses in place of forces."""
+    motor: Spin | None
+    """Likewise."""
+    target: Float[Array, "slot lane"] | None
+    """Speed of the motor [rad/s, m/s]."""
+    lower: Float[Array, "slot lane"] | None
+    """Ends of the range [rad, m]."""
+    upper: Float[Array, "slot lane"] | None
+
+
+class Prepared(NamedTuple):
+    """What depends on scene, params and step length alone, in lanes."""
+
+    length: Float[Array, " lane"]
+    mobile: Float[Array, "body lane"]
+    mass: Float[Array, "body lane"]
+    inertia: Float[Array, "body lane"]
+    weight: tuple[Float[Array, "body lane"], Float[Array, "body lane"]]
+    contacts: Contact | None
+    spins: Spin | None
+    joints: Joints
+    turning: Drive | None
+    """Of the revolute slots."""
+    sliding: Drive | None
+    """Of the prismatic slots."""
+
+
+def is_lone(scene: Scene, params: Params) -> bool:
+    """Whether there is one body, with what `lone_body` knows to solve at once."""
+    pins = params.revolute
+    extras = (params.prismatic, params.weld, pins.limit, pins.motor)
+    return (
+        scene.num_bodies == 1
+        and pins.active.shape[-1] <= 1
+        and params.distance.active.shape[-1] == 0
+        and all(extra is None for extra in extras)
+        and contact_groups(scene, params).num_contacts <= MOST_LONE_CONTACTS
+    )
+
+
+def prepare_lone(scene: Scene, params: Params, length: FloatScalar) -> LoneBody:
+    """Prepare a scene of which `is_lone` holds.
+
+    Args:
+        scene: outlines, feet, gravity.
+        params: one hypothesis.
+        length: of a step [s].
+
+    Returns:
+        All that its time loop needs.
+    """
+    bodies, groups = prepare_bodies(scene, params, length)
+    facing = jnp.zeros_like(bodies.mass)
+    if groups.num_wheels:
+        facing = wheel_headings(params.wheel)[0, 0]
+    return lone_body(
+        bodies.length,
+        bodies.mobile,
+        bodies.mass,
+        bodies.inertia,
+        bodies.weight,
+        bodies.contacts,
+        groups,
+        facing,
+        bodies.spins,
+        _pins(params.revolute, bodies.mass.dtype),
+    )
+
+
+def prepare_world(
+    scene: Scene, params: Params, length: Float[Array, " lane"]
+) -> Prepared:
+    """Prepare any scene.
+
+    Args:
+        scene: outlines, feet, gravity; in lanes, like the others.
+        params: hypotheses.
+        length: of a step [s].
+
+    Returns:
+        All that the time loop needs.
+    """
+
+    def of_one(scene, params, length):
+        return prepare_bodies(scene, params, length)[0]
+
+    bodies = jax.vmap(of_one, in_axes=-1, out_axes=-1)(scene, params, length)
+    length = bodies.length
+    if scene.area.shape[0] == 1:
+        bodies = jax.tree.map(lambda leaf: leaf[..., None, :], bodies)
+    joints = joints_of(params, bodies.mass.dtype)
+    turning = sliding = None
+    if joints.turns is not None:
+        ease = _both(joints.turns, bodies.mobile / bodies.inertia)
+        has_friction = scene.area.shape[0] > 1
+        turning = _drive(params.revolute, ease, length, has_friction)
+    if joints.guides is not None and params.prismatic is not None:
+        ease = _both(joints.guides, bodies.mobile / bodies.mass)
+        sliding = _drive(params.prismatic, ease, length, True)
+    return Prepared(
+        length=length,
+        mobile=bodies.mobile,
+        mass=bodies.mass,
+        inertia=bodies.inertia,
+        weight=bodies.weight,
+        contacts=bodies.contacts,
+        spins=bodies.spins,
+        joints=joints,
+        turning=turning,
+        sliding=sliding,
+    )
+
+
+def prepare_bodies(
+    scene: Scene, params: Params, length: FloatScalar
+) -> tuple[Bodies, Groups]:
+    """Masses, frictions with impulses in place of forces, and their blend weights.
+
+    Args:
+        scene: outlines, feet, gravity; not in lanes.
+        params: one hypothesis.
+        length: of a step [s].
+
+    Returns:
+        What is of each body, and which points of friction belong together. Of a lone
+        body the friction of its pins is among that against spin.
+    """
     length = length / scene.num_substeps
     dtype = scene.area.dtype
     mobile = 1.0 - scene.is_static.astype(dtype)
@@ -55,25 +192,14 @@ def prepare(scene: Scene, params: Params, length: FloatScalar) -> Prepared | Lon
     mass = jnp.where(scene.is_static, 1.0, params.density * scene.area)
     inertia = jnp.where(scene.is_static, 1.0, mass * scene.gyration)
     contacts, spins = friction_points(scene, params, mass)
+    pins = []
     if scene.num_bodies == 1:
         mobile, mass, inertia = (array[0] for array in (mobile, mass, inertia))
         contacts, spins = jax.tree.map(lambda array: array[:, 0], (contacts, spins))
-    revolute = params.revolute
-    pins = joint_slots(revolute, scene.num_bodies)
-    rods = joint_slots(params.distance, scene.num_bodies)
-    joints = joint_spin(revolute.viscous, revolute.dry, revolute.active)
-    joint_spins = []
-    if scene.num_bodies > 1:
-        joint_spins = [
-            _fit_joint(
-                slot,
-                jax.tree.map(lambda leaf, i=i: leaf[i], joints),
-                mobile / inertia,
-                length,
-            )
-            for i, slot in enumerate(pins)
-        ]
-    elif pins:
+        pins = _pins(params.revolute, dtype)
+    if pins:
+        revolute = params.revolute
+        joints = joint_spin(revolute.viscous, revolute.dry, revolute.active)
         spins = (
             joints
             if spins is None
@@ -94,53 +220,57 @@ def prepare(scene: Scene, params: Params, length: FloatScalar) -> Prepared | Lon
         fit_weights(groups, contacts, spins, inverse, mass, inertia, mobile, length)
     )
     weight = (length * mass * scene.gravity[0], length * mass * scene.gravity[1])
-    is_lone = scene.num_bodies == 1 and len(pins) <= 1 and not rods
-    if is_lone and groups.num_contacts <= MOST_LONE_CONTACTS:
-        facing = jnp.zeros_like(mass)
-        if groups.num_wheels:
-            facing = wheel_headings(params.wheel)[0, 0]
-        return lone_body(
-            length,
-            mobile,
-            mass,
-            inertia,
-            weight,
-            contacts,
-            groups,
-            facing,
-            spins,
-            pins,
+    return Bodies(length, mobile, mass, inertia, weight, contacts, spins), groups
+
+
+def _pins(revolute: Revolute, dtype) -> list[Pin]:
+    """Slots of a scene of one body."""
+    return [
+        Pin(
+            active=revolute.active[slot].astype(dtype),
+            anchor_a=(revolute.anchor_a[slot, 0], revolute.anchor_a[slot, 1]),
+            anchor_b=(revolute.anchor_b[slot, 0], revolute.anchor_b[slot, 1]),
         )
-    prepared = Prepared(
-        length=length,
-        mobile=mobile,
-        mass=mass,
-        inertia=inertia,
-        weight=weight,
-        contacts=contacts,
-        spins=spins,
-        slots=pins + rods,
-        joint_spins=joint_spins,
-    )
-    return jax.tree.map(
-        lambda leaf: (
-            # Likewise, for every state and every step.
-            leaf
-            if leaf is length or not jnp.issubdtype(leaf.dtype, jnp.floating)
-            else hold(leaf, jnp.reshape(one, (-1,))[0])
-        ),
-        prepared,
-    )
+        for slot in range(revolute.active.shape[0])
+    ]
 
 
-def _fit_joint(slot: Slot, spin: Spin, ease, length) -> tuple[Slot, Spin]:
-    """Friction between two bodies with impulses in place of torques."""
-    viscous = length * spin.viscous
-    decay = viscous * slot.active * (select(slot.a, ease) + select(slot.b, ease))
-    return slot, Spin(viscous, spin.knee, implicit_weight(decay))
+def _both(ends: Ends, ease: Float[Array, "body lane"]) -> Float[Array, "slot lane"]:
+    """Speed per impulse between two bodies, each otherwise free."""
+    at_b = jnp.where(ends.has_b > 0.0, of_body(ends.b, ease), 0.0)
+    return ends.on * (of_body(ends.a, ease) + at_b)
 
 
-def _mobility(pins: list[Slot], mass, inertia):
+def _drive(
+    joint: Revolute | Prismatic, ease, length: Float[Array, " lane"], has_friction: bool
+) -> Drive:
+    """Friction, motor and limits of a kind, impulses in place of forces."""
+    friction = motor = target = lower = upper = None
+    # In single precision a stiffness beyond this would drown inertias in rounding.
+    most = 1e-4 / jnp.finfo(ease.dtype).eps / jnp.where(ease > 0.0, ease, 1.0)
+
+    def bounded(spin: Spin) -> Spin:
+        viscous = length[None] * spin.viscous
+        scale = jnp.minimum(1.0, most / jnp.where(viscous > 0.0, viscous, 1.0))
+        scale = jnp.where(viscous > 0.0, scale, 1.0)
+        viscous = viscous * scale
+        return Spin(viscous, spin.knee * scale, implicit_weight(viscous * ease))
+
+    if has_friction:
+        friction = bounded(joint_spin(joint.viscous, joint.dry, joint.active))
+    if joint.motor is not None:
+        target, strength = joint.motor[:, 0], joint.motor[:, 1]
+        motor = bounded(joint_spin(strength / KNEE_SPEED, strength, joint.active))
+        motor = motor._replace(weight=jnp.ones_like(target))
+    if joint.limit is not None:
+        on = joint.active
+        # Finite, for the sake of derivatives.
+        lower = jnp.where(on, jnp.maximum(joint.limit[:, 0], -_FAR), -_FAR)
+        upper = jnp.where(on, jnp.minimum(joint.limit[:, 1], _FAR), _FAR)
+    return Drive(friction, motor, target, lower, upper)
+
+
+def _mobility(pins: list[Pin], mass, inertia):
     """Twist per impulse in the body frame, with pins to the world held."""
     zero = jnp.zeros_like(mass)
     inverse = [

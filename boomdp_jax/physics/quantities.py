@@ -4,12 +4,13 @@ All are functions of one world; the caller adds `vmap` over time or hypotheses. 
 bodies are left out: whatever holds them takes up any momentum, and they do no work.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar
-from boomdp_jax.physics.joints import joint_slots
-from boomdp_jax.physics.motion import motion_of
+from boomdp_jax.physics.joints import joints_of
+from boomdp_jax.physics.motion import Motion
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
@@ -147,9 +148,9 @@ def constraint_error(scene: Scene, params: Params, state: State) -> FloatScalar:
             f"Scene has {scene.num_bodies} bodies but the state {state.pose.shape[0]}; "
             "give the state of this scene."
         )
-    slots = [
-        slot
-        for joint in (params.revolute, params.distance)
-        for slot in joint_slots(joint, scene.num_bodies)
-    ]
-    return joint_drift(slots, motion_of(state))
+    dtype = state.pose.dtype
+    params, motion, gyration = jax.tree.map(
+        lambda leaf: leaf[..., None],
+        (params, Motion(*state.pose.T, *state.twist.T), scene.gyration),
+    )
+    return joint_drift(joints_of(params, dtype), motion, gyration)[0]

@@ -7,13 +7,19 @@ import numpy as np
 
 from boomdp_jax.core.arrays import on_device
 from boomdp_jax.physics.body_spec import BodySpec
-from boomdp_jax.physics.constraint_spec import ConstraintSpec, missing_numbers
+from boomdp_jax.physics.constraint_spec import (
+    JOINTS,
+    ConstraintSpec,
+    missing_numbers,
+)
 from boomdp_jax.physics.params import (
     Distance,
     Ground,
     Params,
+    Prismatic,
     Revolute,
     Surface,
+    Weld,
     Wheel,
 )
 from boomdp_jax.physics.scene import Scene
@@ -129,10 +135,8 @@ def build_params(
         for field in missing_numbers(constraint):
             owner = f"{constraint.kind} of body {bodies[constraint.body_a].name!r}"
             _refuse_unknown(source, owner, field)
-    joints = {
-        kind: [c for c in constraints if c.kind == kind]
-        for kind in ("revolute", "distance")
-    }
+    joints = {kind: [c for c in constraints if c.kind == kind] for kind in JOINTS}
+    prismatic, weld = joints["prismatic"], joints["weld"]
     density = [1.0 if body.density is None else body.density for body in bodies]
     return Params(
         density=on_device(density),
@@ -140,6 +144,7 @@ def build_params(
             **_joint_slots(joints["revolute"]),
             viscous=_stack(joints["revolute"], "viscous"),
             dry=_stack(joints["revolute"], "dry"),
+            **_drives(joints["revolute"]),
         ),
         distance=Distance(
             **_joint_slots(joints["distance"]),
@@ -159,7 +164,28 @@ def build_params(
             )
         ),
         surface=build_surface(bodies),
+        prismatic=Prismatic(
+            **_joint_slots(prismatic),
+            **{
+                key: _stack(prismatic, key)
+                for key in ("axis", "angle", "viscous", "dry")
+            },
+            **_drives(prismatic),
+        )
+        if prismatic
+        else None,
+        weld=Weld(**_joint_slots(weld), angle=_stack(weld, "angle")) if weld else None,
     )
+
+
+def _drives(joints: Sequence[ConstraintSpec]) -> dict[str, jax.Array]:
+    """Ranges and motors, if any of a kind's joints has one."""
+    nothing = {"limit": [-np.inf, np.inf], "motor": [0.0, 0.0]}
+    return {
+        key: on_device(np.array([joint.numbers.get(key, none) for joint in joints]))
+        for key, none in nothing.items()
+        if any(key in joint.numbers for joint in joints)
+    }
 
 
 def _collides(bodies: Sequence[BodySpec]) -> jax.Array | None:

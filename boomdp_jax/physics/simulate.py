@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar, Key
-from boomdp_jax.physics.contact_rollout import empty_cache
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State, state_from_array
 from boomdp_jax.physics.step import StepInfo, prepare_step, step
+from boomdp_jax.physics.world_rollout import empty_cache
 
 _CHANNEL_GROUP = np.array([0, 0, 1, 2, 2, 3], np.int32)
 """Group of each channel of a state: position, angle, velocity, spin."""

@@ -1,9 +1,11 @@
-"""Small linear solves written out in scalars, which is what fuses and vectorises."""
+"""Small linear solves: written out in scalars, or along lanes."""
 
+import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
-# Above this many rows the written-out elimination compiles too slowly.
-_UNROLLED_ROWS = 14
+# Rows that are not worth finding out which of them are needed.
+_FEW_ROWS = 12
 
 
 def inverse3(a):
@@ -37,50 +39,6 @@ def dot3(x, y):
     return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
 
 
-def solve_rows(s, rhs):
-    """Solve a small dense system by elimination without pivoting.
-
-    The systems of this engine are close to symmetric and positive definite, where
-    pivoting is not needed.
-
-    Args:
-        s: list of rows, each a list of scalar arrays.
-        rhs: list of scalar arrays.
-
-    Returns:
-        The solution, a list of scalar arrays.
-    """
-    num = len(rhs)
-    if num == 0:
-        return []
-    if num == 1:
-        return [rhs[0] / s[0][0]]
-    if num == 2:
-        scale = 1.0 / (s[0][0] * s[1][1] - s[0][1] * s[1][0])
-        return [
-            (s[1][1] * rhs[0] - s[0][1] * rhs[1]) * scale,
-            (s[0][0] * rhs[1] - s[1][0] * rhs[0]) * scale,
-        ]
-    if num > _UNROLLED_ROWS:
-        matrix = jnp.stack([jnp.stack(row) for row in s])
-        return list(jnp.linalg.solve(matrix, jnp.stack(rhs)))
-    s, rhs = [list(row) for row in s], list(rhs)
-    for k in range(num):
-        pivot = 1.0 / s[k][k]
-        for i in range(k + 1, num):
-            factor = s[i][k] * pivot
-            for j in range(k + 1, num):
-                s[i][j] = s[i][j] - factor * s[k][j]
-            rhs[i] = rhs[i] - factor * rhs[k]
-    solution = [None] * num
-    for k in reversed(range(num)):
-        total = rhs[k]
-        for j in range(k + 1, num):
-            total = total - s[k][j] * solution[j]
-        solution[k] = total / s[k][k]
-    return solution
-
-
 def solve3(a, b):
     """Solve a 3 x 3 system by Cramer's rule.
 
@@ -102,3 +60,57 @@ def solve3(a, b):
         (c02, a01 * a20 - a00 * a21, a00 * a11 - a01 * a10),
     )
     return tuple(scale * value for value in matvec3(adjugate, b))
+
+
+def solve_in_lanes(
+    matrix: Float[Array, "row row lane"],
+    rhs: Float[Array, "row lane"],
+    is_needed: Bool[Array, "row lane"],
+) -> Float[Array, "row lane"]:
+    """Solve a dense system in every lane, by elimination without pivoting.
+
+    The systems of this engine are close to symmetric and positive definite, where
+    pivoting is not needed.
+
+    Args:
+        matrix: of each lane.
+        rhs: of each lane.
+        is_needed: false for a row that is a unit row with a right-hand side of zero;
+            one that no lane needs costs next to nothing.
+
+    Returns:
+        The solution.
+    """
+    order, num = jnp.arange(matrix.shape[0]), matrix.shape[0]
+    if num > _FEW_ROWS:
+        counts = jnp.any(is_needed, axis=1)
+        order = jnp.argsort(jnp.where(counts, 0, 1), stable=True)
+        num = jnp.sum(counts)
+
+    def times(x):
+        return jnp.sum(matrix * x[None], axis=1)
+
+    def solve(_, b):
+        return _eliminated(matrix, b, order, num)
+
+    def solve_transposed(_, b):
+        return _eliminated(jnp.swapaxes(matrix, 0, 1), b, order, num)
+
+    return jax.lax.custom_linear_solve(times, rhs, solve, solve_transposed)
+
+
+def _eliminated(matrix, rhs, order, num):
+    """Gauss and Jordan's elimination: every pass leaves a column of the unit matrix."""
+    whole = jnp.concatenate([matrix, rhs[:, None]], axis=1)
+    index = jnp.arange(matrix.shape[0])
+
+    def clear(turn, whole):
+        k = order[turn]
+        pivots = jax.lax.dynamic_index_in_dim(whole, k, axis=0, keepdims=False)
+        column = jax.lax.dynamic_index_in_dim(whole, k, axis=1, keepdims=False)
+        inverse = 1.0 / jax.lax.dynamic_index_in_dim(pivots, k, 0, keepdims=False)
+        is_pivot = (index == k)[:, None, None]
+        scaled = inverse[None] * pivots
+        return jnp.where(is_pivot, scaled[None], whole - column[:, None] * scaled[None])
+
+    return jax.lax.fori_loop(0, num, clear, whole)[:, -1]

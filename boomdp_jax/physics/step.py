@@ -2,11 +2,13 @@ r"""One step of the world, and many: the public face of the engine.
 
 A substep of length h, for every body at once:
 
-1. turn half-way with the present spin; express twists in the frame found there;
+1. turn half-way with the present spin; express friction in the frame found there;
 2. solve for the new twists: forces, friction and joint impulses at mid-step, joints
    holding at the end (`velocity_solve`);
 3. move with the mean of old and new twist;
-4. put joint drift right, in position and in velocity, weighted by mass.
+4. put joint drift right, in position and in velocity, weighted by mass (`projection`);
+   where a joint turned so far that none of this is right any more, no energy is left
+   that nothing brought (`general_step.projected`).
 
 Second order for smooth motion; a single contact's viscous decay, its response to a
 constant force and dry sliding in a straight line are exact. Where a contact changes
@@ -40,17 +42,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from boomdp_jax.physics.contact_rollout import contact_rollout, contact_step
-from boomdp_jax.physics.general_step import general_substep
 from boomdp_jax.physics.lone_body import LoneBody
 from boomdp_jax.physics.lone_step import lone_step
 from boomdp_jax.physics.motion import Motion, motion_of, scalars, state_of
 from boomdp_jax.physics.params import Params
-from boomdp_jax.physics.prepare import Prepared, prepare
+from boomdp_jax.physics.prepare import is_lone, prepare_lone
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
 from boomdp_jax.physics.step_info import StepInfo as StepInfo
-from boomdp_jax.physics.step_info import report
+from boomdp_jax.physics.world_rollout import (
+    prepare_step_of_world,
+    world_rollout,
+    world_step,
+)
 
 
 def step(
@@ -77,11 +81,7 @@ def step(
         The next state, and what there is to report.
     """
     length = jnp.asarray(scene.dt if dt is None else dt, state.pose.dtype)
-    if scene.collides is not None:
-        return contact_step(scene, params, state, wrench, length, cache)
-    prepared = prepare(scene, params, length)
-    motion, info = _step(scene, prepared, motion_of(state), wrench)
-    return state_of(motion, scene.num_bodies), info
+    return _step_of(scene, params, length)(state, wrench, cache)
 
 
 def prepare_step(
@@ -102,17 +102,8 @@ def prepare_step(
         is to report; the same as `step`.
     """
     length = jnp.asarray(scene.dt if dt is None else dt, scene.area.dtype)
-    if scene.collides is not None:
-        return lambda state, wrench: contact_step(
-            scene, params, state, wrench, length, None
-        )
-    prepared = prepare(scene, params, length)
-
-    def advance(state: State, wrench: Float[Array, "body 3"]) -> tuple[State, StepInfo]:
-        motion, info = _step(scene, prepared, motion_of(state), wrench)
-        return state_of(motion, scene.num_bodies), info
-
-    return advance
+    advance = _step_of(scene, params, length)
+    return lambda state, wrench: advance(state, wrench, None)
 
 
 def rollout(
@@ -139,42 +130,48 @@ def rollout(
         The states after each step and their reports, with a leading time axis.
     """
     length = jnp.asarray(scene.dt if dt is None else dt, state.pose.dtype)
-    if scene.collides is not None:
-        return contact_rollout(scene, params, state, wrenches, length)
-    constant = prepare(scene, params, length) if length.ndim == 0 else None
+    if not is_lone(scene, params):
+        return world_rollout(scene, params, state, wrenches, length)
+    constant = prepare_lone(scene, params, length) if length.ndim == 0 else None
 
     def advance(motion, inputs):
-        wrench, step_length = inputs
-        prepared = prepare(scene, params, step_length) if constant is None else constant
-        motion, info = _step(scene, prepared, motion, wrench)
+        wrench, now = inputs
+        body = prepare_lone(scene, params, now) if constant is None else constant
+        motion, info = _lone(scene, body, motion, wrench)
         return motion, (state_of(motion, scene.num_bodies), info)
 
     inputs = (wrenches, length if constant is None else None)
     # A reverse pass takes every step again from the state before it: cheaper than to
     # store the hundred numbers of each substep, and long rollouts fit into memory. A
-    # lone body's does so of itself (`core.one_loop`).
-    is_lone = isinstance(constant, LoneBody)
-    one_step = advance if is_lone else jax.checkpoint(advance, prevent_cse=False)
+    # lone body's does so of itself (`core.one_loop`), but for what depends on length.
+    one_step = advance
+    if constant is None:
+        one_step = jax.checkpoint(advance, prevent_cse=False)
     return jax.lax.scan(one_step, motion_of(state), inputs)[1]
 
 
-def _step(
-    scene: Scene, prepared: Prepared | LoneBody, motion: Motion, wrench
+def _step_of(scene: Scene, params: Params, length: Array) -> Callable:
+    """A function from state, wrench and cache, with what is constant worked out."""
+    if not is_lone(scene, params):
+        world = prepare_step_of_world(scene, params, length)
+        return lambda state, wrench, cache: world_step(
+            scene, world, state, wrench, cache
+        )
+    body = prepare_lone(scene, params, length)
+
+    def advance(state: State, wrench, cache: Any) -> tuple[State, StepInfo]:
+        del cache
+        motion, info = _lone(scene, body, motion_of(state), wrench)
+        return state_of(motion, scene.num_bodies), info
+
+    return advance
+
+
+def _lone(
+    scene: Scene, body: LoneBody, motion: Motion, wrench
 ) -> tuple[Motion, StepInfo]:
     """All substeps of one step."""
-    force = scalars(wrench)
-    if isinstance(prepared, LoneBody):
-        motion, error, is_finite = lone_step(
-            prepared, motion, force, scene.num_substeps
-        )
-        return motion, StepInfo(constraint_error=error, is_finite=is_finite)
-    if scene.num_substeps == 1:
-        motion = general_substep(prepared, motion, force)
-        return motion, report(prepared, motion)
-    motion, _ = jax.lax.scan(
-        lambda m, _: (general_substep(prepared, m, force), None),
-        motion,
-        None,
-        length=scene.num_substeps,
+    motion, error, is_finite = lone_step(
+        body, motion, scalars(wrench), scene.num_substeps
     )
-    return motion, report(prepared, motion)
+    return motion, StepInfo(constraint_error=error, is_finite=is_finite)

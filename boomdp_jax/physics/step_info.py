@@ -6,8 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from boomdp_jax.core.arrays import FloatScalar
-from boomdp_jax.physics.joints import Frames, Slot, joint_rows
+from boomdp_jax.physics.joints import Ends, Frames, Joints, bilateral_rows, of_body
 from boomdp_jax.physics.motion import Motion
 from boomdp_jax.physics.prepare import Prepared
 from boomdp_jax.physics.trigonometry import sincos
@@ -30,39 +29,57 @@ class StepInfo(eqx.Module):
     passed to it; `rollout` passes them on itself and does not return them."""
 
 
-def report(prepared: Prepared, motion: Motion) -> StepInfo:
-    """Joint drift and finiteness of a motion.
+def report(prepared: Prepared, motion: Motion) -> tuple[Array, Array]:
+    """Joint drift and finiteness of motions, in lanes.
 
     Args:
         prepared: what does not depend on the state.
         motion: after a step.
 
     Returns:
-        The report of a world without contact.
+        `StepInfo.constraint_error` and `StepInfo.is_finite`.
     """
-    total = jnp.sum(sum(motion))
-    return StepInfo(
-        constraint_error=joint_drift(prepared.slots, motion),
-        is_finite=jnp.isfinite(total),
-    )
+    gyration = prepared.inertia / prepared.mass
+    drift = joint_drift(prepared.joints, motion, gyration)
+    return drift, jnp.isfinite(jnp.sum(sum(motion), axis=0))
 
 
-def joint_drift(slots: list[Slot], motion: Motion) -> FloatScalar:
-    """Largest distance by which an active joint fails to hold [m].
+def joint_drift(
+    joints: Joints, motion: Motion, gyration: Float[Array, "body lane"]
+) -> Float[Array, " lane"]:
+    """Largest distance by which an active joint fails to hold [m], in lanes.
 
     Args:
-        slots: pins and rods.
+        joints: all slots.
         motion: where the bodies are.
+        gyration: squared radii of gyration, at which an angle is a distance [m²].
 
     Returns:
         The distance; where it is exactly zero its derivative is taken to be zero.
     """
-    square = jnp.zeros((), motion.x.dtype)
-    if slots:
-        sin, cos = sincos(motion.theta)
-        frames = Frames(motion.x, motion.y, cos, sin)
-        for slot in slots:
-            drift = sum(row.error**2 for row in joint_rows([slot], frames))
-            square = jnp.maximum(square, drift)
+    sin, cos = sincos(motion.theta)
+    rows = bilateral_rows(joints, Frames(*motion[:3], cos, sin))
+    square = jnp.zeros_like(motion.x[0])
+    if rows is None:
+        return square
+    squares, first = rows.error**2, 0
+
+    def take(ends: Ends | None) -> Array | None:
+        nonlocal first
+        if ends is None:
+            return None
+        first += ends.on.shape[0]
+        return squares[first - ends.on.shape[0] : first]
+
+    along, across = take(joints.points), take(joints.points)
+    groups = [None if along is None or across is None else along + across]
+    groups.append(take(joints.rods))
+    angles = take(joints.angles)
+    if joints.angles is not None and angles is not None:
+        groups.append(angles * of_body(joints.angles.a, gyration))
+    groups.append(take(joints.guides))
+    for group in groups:
+        if group is not None:
+            square = jnp.maximum(square, jnp.max(group, axis=0))
     has_error = square > 0
     return jnp.where(has_error, jnp.sqrt(jnp.where(has_error, square, 1.0)), 0.0)

@@ -1,36 +1,81 @@
 r"""One implicit velocity update: friction and joints solved together.
 
-Unknown are the twists $w$ (each in its body's frame at mid-step) and the joint
-impulses $\lambda$:
+Unknown are the twists $w$ and the impulses of joints $\lambda$:
 
-$$M w = p + h\,T^T f(\bar u) + J_m^T \lambda, \qquad J_e w = 0, \qquad
+$$M w = p - h\,T^T f(\bar u) + J_m^T \lambda, \qquad J_e w = 0, \qquad
   \bar u = T(\vartheta w + (1-\vartheta) w_0),$$
 
 $J_m$ taken at mid-step, where the impulse acts on average, and $J_e$ at its end, where
-the joint must hold. Newton's method starts from the solution in which every contact
-sticks: from there a contact that slips is left on its own side, and a contact that
-sticks is already solved. Derivatives come from the implicit function theorem at the
-solution, not through the iterations, in both modes.
+the joint must hold. The friction, motor and limits of a joint are rows as well,
+$\lambda = -f(J\bar w - u_{motor})$ and $\lambda \ge 0 \perp J w \ge u_{limit}$.
+Newton's method starts from the solution in which everything sticks: from there a
+contact that slips is left on its own side, and one that sticks is already solved. Each
+iteration eliminates the bodies and solves the rows directly:
+
+$$A = M + h\,T^T K \vartheta T, \qquad (J_e A^{-1} J_m^T + \epsilon)\,\lambda = -J_e
+  A^{-1} b.$$
+
+Derivatives are those of the last iteration with what it starts from held constant,
+which at the solution is the implicit function theorem, in both modes.
 
 Compared on a body with pin and wheel, against two-stage L-stable Runge-Kutta (twice the
 cost, and dry friction then overshoots at the moment of stopping by up to half of a
 step's impulse) and against backward Euler in four substeps (twice the cost, four times
 the error of a wheel's decay).
+
+All arrays are in lanes (`core.lanes`), twists and rows in world axes.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.holding import hold, runtime_one
+from boomdp_jax.core.one_loop import elementwise
+from boomdp_jax.physics.body_friction import (
+    BodyAnswer,
+    Felt,
+    answer_of_bodies,
+    friction_of_bodies,
+)
 from boomdp_jax.physics.friction import NUM_NEWTON, Contact, Spin, limited
-from boomdp_jax.physics.joints import Row, Slot, select
-from boomdp_jax.physics.small_linear import dot3, inverse3, matvec3, solve_rows
+from boomdp_jax.physics.joints import Rows, join_rows, of_body, speed, to_bodies
+from boomdp_jax.physics.small_linear import solve_in_lanes
 
-PerBody = Float[Array, "*body"]
+# Iterations, beside `NUM_NEWTON`, for the few that have not come to rest by then.
+_NUM_DAMPED = 12
+# Relative change in the last iteration from which it has not.
+_UNSETTLED = 1e-3
+
+PerBody = Float[Array, "body lane"]
+PerRow = Float[Array, "row lane"]
 Twist = tuple[PerBody, PerBody, PerBody]
+
+
+class Laws(NamedTuple):
+    """Frictions and motors of joints, each along a row."""
+
+    rows: Rows
+    friction: Spin
+    """Impulses in place of forces."""
+    start: PerRow
+    """Speed at the start of the substep."""
+    target: PerRow
+    """Speed that it drives at, zero for friction."""
+
+
+class Limits(NamedTuple):
+    """Ranges of joints, each along a row."""
+
+    rows: Rows
+    least: PerRow
+    """Speed at which the lower end is met when the substep ends."""
+    most: PerRow
+    ease: PerRow
+    """J M^-1 J^T, which compares impulses with speeds."""
 
 
 class VelocityProblem(NamedTuple):
@@ -41,338 +86,285 @@ class VelocityProblem(NamedTuple):
     mass: PerBody
     inertia: PerBody
     momentum: Twist
-    """p: momentum with the impulse of all known forces, body frame at mid-step."""
+    """p: momentum with the impulse of all known forces."""
     start: Twist
-    """w_0, in the same frame."""
+    """w_0."""
+    frame: tuple[PerBody, PerBody]
+    """Cosine and sine of the bodies at mid-step."""
     turn: tuple[PerBody, PerBody]
-    """Cosine and sine of half the turn of the step."""
+    """Cosine and sine of half the turn of the substep."""
     contacts: Contact | None
-    """All contacts along a leading axis, with impulses in place of forces: coefficients
-    times the length of the step."""
+    """`[contact, body, lane]`, impulses in place of forces."""
     spins: Spin | None
     """Likewise."""
-    rows_mid: list[Row]
-    rows_end: list[Row]
-    compliance: list[Float[Array, ""]]
-    """What keeps redundant and inactive rows solvable."""
-    joint_spins: list[tuple[Slot, Spin]]
-    """Friction of joints between two bodies (scenes of several bodies)."""
+    rows_mid: Rows | None
+    rows_end: Rows | None
+    ease: PerRow | None
+    """J M^-1 J^T of each row, zero for inactive ones."""
+    is_steady: Bool[Array, " lane"] | None
+    """Whether no row turns so far in this substep that it is taken at mid-step."""
+    laws: Laws | None
+    limits: Limits | None
 
 
 class Solution(NamedTuple):
-    """Twists at the end of the step, and the impulses of rows and joint frictions."""
+    """An iterate."""
 
     twist: Twist
-    impulse: list[Float[Array, ""]]
+    before: Twist
+    """In the iteration before (see `friction.is_reversed`)."""
+    impulse: PerRow | None
+    """Of all rows: of joints, of their frictions and motors, of their limits."""
 
 
-def _blend(weight, end, start):
-    return weight * end + (1.0 - weight) * start
+class Solved(NamedTuple):
+    """What an iteration finds."""
+
+    solution: Solution
+    answer: BodyAnswer
+    """What it took bodies to answer to an impulse, joints apart."""
+    is_settled: Bool[Array, " lane"]
+    """Whether a last iteration changed next to nothing, as far as is known."""
 
 
-def _end_rows(problem: VelocityProblem):
-    """T at the end of the step, where a stiff contact must not slip.
-
-    Twists are in the frame at mid-step, half a turn before: T turns along.
-    """
-    contact: Any = problem.contacts
-    cos, sin = (t[None] for t in problem.turn)
-    return tuple(
-        (cos * row[0] - sin * row[1], sin * row[0] + cos * row[1], row[2])
-        for row in (contact.rolling, contact.lateral)
-    )
-
-
-def _start_speed(problem: VelocityProblem):
-    """Contact velocity at the start of the step, half a turn before mid-step."""
-    contact: Any = problem.contacts
-    cos, sin = (t[None] for t in problem.turn)
-    x, y, spin = (v[None] for v in problem.start)
-    start = (cos * x - sin * y, sin * x + cos * y, spin)
-    return tuple(dot3(row, start) for row in (contact.rolling, contact.lateral))
-
-
-def _contact_speed(problem: VelocityProblem, w: Twist):
-    """Rolling and lateral velocity that friction sees, contact axis first."""
-    contact: Any = problem.contacts
-    each = tuple(v[None] for v in w)
-    return tuple(
-        _blend(weight, dot3(row, each), start)
-        for weight, row, start in zip(
-            contact.weight,
-            _end_rows(problem),
-            _start_speed(problem),
-            strict=True,
-        )
-    )
-
-
-def _spin_speed(spin: Spin, w: Twist, start: Twist):
-    return _blend(spin.weight, w[2][None], start[2][None])
-
-
-def _joint_speed(slot: Slot, spin: Spin, w: Twist, start: Twist):
-    def relative(v):
-        return slot.active * (select(slot.a, v) - select(slot.b, v))
-
-    return _blend(spin.weight, relative(w[2]), relative(start[2]))
-
-
-def _residual(
-    problem: VelocityProblem, solution: Solution, before: Twist | None = None
-):
-    """How far from solved: per body three numbers, then one per row."""
-    w, start = solution.twist, problem.start
-    out = [
-        problem.mass * w[0] - problem.momentum[0],
-        problem.mass * w[1] - problem.momentum[1],
-        problem.inertia * w[2] - problem.momentum[2],
-    ]
-    contact, spin = problem.contacts, problem.spins
-    if contact is not None:
-        u = _contact_speed(problem, w)
-        old = None if before is None else _contact_speed(problem, before)
-        scale, _ = limited(u, contact.viscous, contact.knee, old)
-        rolling = scale * contact.viscous[0] * u[0]
-        lateral = scale * contact.viscous[1] * u[1]
-        out = [
-            o + jnp.sum(rolling * r + lateral * t, axis=0)
-            for o, r, t in zip(out, contact.rolling, contact.lateral, strict=True)
-        ]
-    if spin is not None:
-        u = _spin_speed(spin, w, start)
-        old = None if before is None else (_spin_speed(spin, before, start),)
-        scale, _ = limited((u,), (spin.viscous,), (spin.knee,), old)
-        out[2] = out[2] + jnp.sum(scale * spin.viscous * u, axis=0)
-    num = len(problem.rows_mid)
-    for row, impulse in zip(problem.rows_mid, solution.impulse[:num], strict=True):
-        out = [o - j * impulse for o, j in zip(out, row.push(), strict=True)]
-    tail = [
-        row.velocity(w) + compliance * impulse
-        for row, compliance, impulse in zip(
-            problem.rows_end, problem.compliance, solution.impulse[:num], strict=True
-        )
-    ]
-    for (slot, joint), impulse in zip(
-        problem.joint_spins, solution.impulse[num:], strict=True
-    ):
-        weight_a: Any = slot.a
-        out[2] = out[2] - impulse * slot.active * (weight_a - slot.b)
-        u = _joint_speed(slot, joint, w, start)
-        old = None if before is None else (_joint_speed(slot, joint, before, start),)
-        scale, _ = limited((u,), (joint.viscous,), (joint.knee,), old)
-        tail.append(scale * joint.viscous * u + impulse)
-    return tuple(out), tail
-
-
-def slopes_of(problem: VelocityProblem, w: Twist, before: Twist | None = None):
-    """K of every friction at a twist.
-
-    Args:
-        problem: frictions.
-        w: the twist.
-        before: the twist in the iteration before (see `friction.is_reversed`).
-
-    Returns:
-        Of contacts, of spins and of joints between two bodies.
-    """
-    start, contact, spin = problem.start, problem.contacts, problem.spins
-    k_contact = k_spin = None
-    if contact is not None:
-        u = _contact_speed(problem, w)
-        old = None if before is None else _contact_speed(problem, before)
-        _, k_contact = limited(u, contact.viscous, contact.knee, old)
-    if spin is not None:
-        u = _spin_speed(spin, w, start)
-        old = None if before is None else (_spin_speed(spin, before, start),)
-        _, ((k_spin,),) = limited((u,), (spin.viscous,), (spin.knee,), old)
-    k_joints = []
-    for slot, joint in problem.joint_spins:
-        u = _joint_speed(slot, joint, w, start)
-        old = None if before is None else (_joint_speed(slot, joint, before, start),)
-        _, ((k,),) = limited((u,), (joint.viscous,), (joint.knee,), old)
-        k_joints.append(k)
-    return k_contact, k_spin, k_joints
-
-
-def damped_inertia(problem: VelocityProblem, k_contact, k_spin):
-    """M + T^T K Theta T, as rows of entries.
-
-    Args:
-        problem: masses and frictions.
-        k_contact: K of contacts (`slopes_of`).
-        k_spin: K of spins.
-
-    Returns:
-        What momentum per twist is like to forces from outside.
-    """
+def first_guess(problem: VelocityProblem) -> Solution:
+    """From which an iteration finds the solution in which everything sticks."""
     zero = jnp.zeros_like(problem.mass)
-    a = [
-        [problem.mass, zero, zero],
-        [zero, problem.mass, zero],
-        [zero, zero, problem.inertia],
-    ]
-    contact, spin = problem.contacts, problem.spins
-    if contact is not None:
-        rows, end = (contact.rolling, contact.lateral), _end_rows(problem)
-        k = [[k_contact[i][j] * contact.weight[j] for j in range(2)] for i in range(2)]
-        for m in range(3):
-            pulls = [sum(k[i][j] * rows[i][m] for i in range(2)) for j in range(2)]
-            for n in range(3):
-                entry = pulls[0] * end[0][n] + pulls[1] * end[1][n]
-                a[m][n] = a[m][n] + jnp.sum(entry, axis=0)
-    if spin is not None:
-        a[2][2] = a[2][2] + jnp.sum(k_spin * spin.weight, axis=0)
-    return a
-
-
-def _solve_linear(
-    problem: VelocityProblem, slopes, rhs: Twist, rhs_rows: list
-) -> Solution:
-    """Solve the system linearised with the given slopes of friction."""
-    k_contact, k_spin, k_joints = slopes
-    one = runtime_one(problem.mass)
-
-    def held(values):
-        return jax.tree.map(lambda v: hold(v, one), values)
-
-    inverse = inverse3(held(damped_inertia(problem, k_contact, k_spin)))
-    inverse = held([[problem.mobile * entry for entry in row] for row in inverse])
-    free = matvec3(inverse, held(rhs))
-    num, num_joints = len(problem.rows_mid), len(problem.joint_spins)
-    if num + num_joints == 0:
-        return Solution(free, [])
-    # Each row moves bodies along columns A^-1 J_mid^T.
-    dtype = problem.mass.dtype
-    unit, none = jnp.ones((), dtype), jnp.zeros((), dtype)
-    turning = [
-        Row(slot, (none, none, slot.active), (none, none, -slot.active), none)
-        for slot, _ in problem.joint_spins
-    ]
-    end = problem.rows_end + turning
-    columns = [held(matvec3(inverse, row.push())) for row in problem.rows_mid + turning]
-    free = held(free)
-    gains = [unit] * num + [
-        k * spin.weight
-        for k, (_, spin) in zip(k_joints, problem.joint_spins, strict=True)
-    ]
-    diagonal = problem.compliance + [unit] * num_joints
-    matrix = [
-        [
-            gains[i] * end[i].velocity(columns[j]) + (diagonal[i] if i == j else 0.0)
-            for j in range(len(columns))
-        ]
-        for i in range(len(end))
-    ]
-    impulse = solve_rows(
-        matrix,
-        [rhs_rows[i] - gains[i] * end[i].velocity(free) for i in range(len(end))],
-    )
-    impulse = [hold(v, jnp.reshape(one, (-1,))[0]) for v in impulse]
-    twist = list(free)
-    for column, strength in zip(columns, impulse, strict=True):
-        twist = [t + c * strength for t, c in zip(twist, column, strict=True)]
-    return Solution(tuple(twist), impulse)
-
-
-def _newton(problem: VelocityProblem) -> Solution:
-    """Start from sticking contacts, then iterate."""
-    num = len(problem.rows_mid) + len(problem.joint_spins)
-    zero = jnp.zeros_like(problem.mass)
-    rest = Solution((zero, zero, zero), [jnp.zeros((), zero.dtype)] * num)
-    # Sticking is the viscous law without limits, whose solution is one linear solve.
-    sticking = _unlimited(problem)
-    solution = newton_step(sticking, rest, None)
-    if problem.contacts is None and problem.spins is None and not problem.joint_spins:
-        return solution
-
-    def advance(_, pair):
-        solution, before = pair
-        return newton_step(problem, solution, before), solution.twist
-
-    first = (solution, solution.twist)
-    return jax.lax.fori_loop(0, NUM_NEWTON, advance, first)[0]
-
-
-def _unlimited(problem: VelocityProblem) -> VelocityProblem:
-    def free(friction):
-        if friction is None:
-            return None
-        return friction._replace(knee=jax.tree.map(jnp.zeros_like, friction.knee))
-
-    return problem._replace(
-        contacts=free(problem.contacts),
-        spins=free(problem.spins),
-        joint_spins=[(slot, free(spin)) for slot, spin in problem.joint_spins],
-    )
+    sizes = [problem.ease]
+    sizes += [None if problem.laws is None else problem.laws.start]
+    sizes += [None if problem.limits is None else problem.limits.ease]
+    rows = [jnp.zeros_like(size) for size in sizes if size is not None]
+    rest = (zero, zero, zero)
+    return Solution(rest, rest, jnp.concatenate(rows) if rows else None)
 
 
 def newton_step(
-    problem: VelocityProblem, solution: Solution, before: Twist | None
-) -> Solution:
+    problem: VelocityProblem, guess: Solution, is_limited: Any = 1.0
+) -> Solved:
     """One iteration of Newton's method.
 
     Args:
         problem: momenta, frictions and joint rows.
-        solution: where it starts.
-        before: the twist in the iteration before.
+        guess: where it starts.
+        is_limited: one, or zero to leave out the dry limits, so that everything sticks.
 
     Returns:
         Twists and impulses of the system linearised there.
     """
-    out, tail = _residual(problem, solution, before)
-    step = _solve_linear(
-        problem,
-        slopes_of(problem, solution.twist, before),
-        tuple(-o for o in out),
-        [-t for t in tail],
+    felt = Felt(problem.frame, problem.turn, problem.start, guess.twist, guess.before)
+    friction = friction_of_bodies(problem.contacts, problem.spins, felt, is_limited)
+    unknown, zero = jnp.ones(problem.mass.shape[-1], bool), jnp.zeros_like(problem.mass)
+    given = (zero, zero, zero)
+    if guess.impulse is None:
+        answer, free = answer_of_bodies(problem, friction, guess.twist, given)
+        return Solved(Solution(free, guess.twist, None), answer, unknown)
+    push, end, gain, diagonal, demand, is_needed = _system(problem, guess, is_limited)
+    pushes = tuple(tuple(j * guess.impulse for j in row) for row in (push.ja, push.jb))
+    given = to_bodies(push, pushes, given)
+    answer, free = answer_of_bodies(problem, friction, guess.twist, given)
+    columns, lacking = elementwise(
+        _column,
+        (push.ja, push.jb, end.ja, end.jb, gain, demand),
+        *(of_body(index, (answer, free)) for index in (push.a, push.b)),
     )
-    return jax.tree.map(jnp.add, solution, step)
+    matrix = gain[:, None] * coupled(end, push, columns)
+    matrix = matrix + on_diagonal(diagonal)
+    lacking = lacking - diagonal * guess.impulse
+    change = solve_in_lanes(matrix, lacking, is_needed)
+    twist = moved_by_rows(free, push, columns, change)
+    one = runtime_one(problem.mass)
+    x, y, spin = (hold(v, one) for v in twist)
+    impulse = guess.impulse + change
+    return Solved(Solution((x, y, spin), guess.twist, impulse), answer, unknown)
 
 
-def solve_velocity(problem: VelocityProblem) -> Solution:
+def coupled(end: Rows, push: Rows, columns: tuple) -> Float[Array, "row row lane"]:
+    """J A^-1 J^T, given what pushes along the second do to their bodies."""
+
+    def between(i, j, answer):
+        return [jnp.where(i[:, None] == j[None], c[None], 0.0) for c in answer]
+
+    total = 0.0
+    for index, row in ((end.a, end.ja), (end.b, end.jb)):
+        parts = [between(index, push.a, columns[0]), between(index, push.b, columns[1])]
+        for j, p, q in zip(row, *parts, strict=True):
+            total = total + j[:, None] * (p + q)
+    return jnp.asarray(total)
+
+
+def moved_by_rows(
+    twist: tuple, rows: Rows, columns: tuple, impulse: PerRow
+) -> tuple[PerBody, PerBody, PerBody]:
+    """Twists after impulses along rows."""
+    pushes = tuple(tuple(c * impulse for c in column) for column in columns)
+    return to_bodies(rows, pushes, twist)
+
+
+def compliance_of(ease: PerRow) -> PerRow:
+    """Enough softness to keep redundant rows solvable; one for inactive rows."""
+    tiny = 0.03 * jnp.sqrt(jnp.finfo(ease.dtype).eps)
+    return jnp.where(ease > 0.0, tiny * ease, 1.0)
+
+
+def on_diagonal(values: PerRow) -> Float[Array, "row row lane"]:
+    """Diagonal matrices."""
+    unit = jnp.eye(values.shape[0], dtype=values.dtype)
+    return unit[..., None] * values[None]
+
+
+def _column(rows: tuple, at_a: tuple, at_b: tuple) -> tuple:
+    """What a push along a row does to its bodies, and what the row lacks without it."""
+    push_a, push_b, end_a, end_b, gain, demand = rows
+    columns = tuple(
+        BodyAnswer(*answer)(*push)
+        for push, (answer, _) in ((push_a, at_a), (push_b, at_b))
+    )
+    moving = sum(j * v for j, v in zip(end_a, at_a[1], strict=True))
+    moving = moving + sum(j * v for j, v in zip(end_b, at_b[1], strict=True))
+    return columns, demand - gain * moving
+
+
+def _system(problem: VelocityProblem, guess: Solution, is_limited) -> tuple:
+    """Rows that push and rows that are held, with g J_e w + d lambda = r."""
+    push, end, gain, diagonal, demand, needs = [], [], [], [], [], []
+    if problem.rows_mid is not None:
+        push.append(problem.rows_mid)
+        end.append(problem.rows_end)
+        ease: Any = problem.ease
+        gain.append(jnp.ones_like(ease))
+        diagonal.append(compliance_of(ease))
+        demand.append(jnp.zeros_like(ease))
+        needs.append(ease > 0.0)
+    if problem.laws is not None:
+        laws = problem.laws
+        seen = speed(laws.rows, guess.twist), speed(laws.rows, guess.before)
+        slope, offset = elementwise(
+            _law, laws.friction, laws.start, laws.target, *seen, is_limited
+        )
+        push.append(laws.rows)
+        end.append(laws.rows)
+        gain.append(slope)
+        diagonal.append(jnp.ones_like(slope))
+        demand.append(offset)
+        needs.append(laws.friction.viscous > 0.0)
+    if problem.limits is not None:
+        limits = problem.limits
+        pressure: Any = guess.impulse
+        pressure = pressure[-limits.ease.shape[0] :]
+        parts = elementwise(
+            _limit, *limits[1:], speed(limits.rows, guess.twist), pressure
+        )
+        push.append(limits.rows)
+        end.append(limits.rows)
+        for whole, part in zip((gain, diagonal, demand), parts, strict=True):
+            whole.append(part)
+        needs.append(parts[0] > 0.0)
+    return (
+        join_rows(*push),
+        join_rows(*end),
+        *(jnp.concatenate(parts) for parts in (gain, diagonal, demand, needs)),
+    )
+
+
+def _law(spin: Spin, start, target, now, before, is_limited) -> tuple:
+    """Slope of a friction and its demand: lambda + slope J w = demand."""
+
+    def blend(value):
+        return spin.weight * value + (1.0 - spin.weight) * start - target
+
+    knee, u = spin.knee * is_limited, blend(now)
+    scale, ((k,),) = limited((u,), (spin.viscous,), (knee,), (blend(before),))
+    slope = k * spin.weight
+    return slope, slope * now - scale * spin.viscous * u
+
+
+def _limit(least, most, ease, now, pressure) -> tuple:
+    """Gain, diagonal and demand of a range: held at an end, or left alone."""
+    # What the row would do without what the limit gives.
+    free = now - ease * pressure
+    is_least, is_most = free < least, free > most
+    is_held = (is_least | is_most) & (ease > 0.0)
+    one, zero = jnp.ones_like(now), jnp.zeros_like(now)
+    softness = 1e-6 * ease
+    return (
+        jnp.where(is_held, one, zero),
+        jnp.where(is_held, softness, one),
+        jnp.where(is_held, jnp.where(is_least, least, most), zero),
+    )
+
+
+def solve_velocity(problem: VelocityProblem) -> Solved:
     """Solve one velocity update.
 
     Args:
         problem: momenta, frictions and joint rows.
 
     Returns:
-        Twists and impulses. Differentiable by the implicit function theorem.
+        Twists and impulses.
     """
+    guess = first_guess(problem)
+    has_friction = problem.contacts is not None or problem.spins is not None
+    if not has_friction and problem.laws is None and problem.limits is None:
+        return newton_step(problem, guess)
+    constant = jax.lax.stop_gradient(problem)
 
-    @jax.custom_jvp
-    def solve(problem):
-        return _newton(problem)
+    lanes = problem.mass.shape[-1]
 
-    def solve_jvp(primals, tangents):
-        (problem,), (rate,) = primals, tangents
-        solution = solve(problem)
-        leaves, treedef = jax.tree.flatten(problem)
-        rates = jax.tree.leaves(
-            rate, is_leaf=lambda x: isinstance(x, jax.custom_derivatives.SymbolicZero)
+    def goes_on(carry):
+        turn, _, is_moving = carry
+        return jnp.any(is_moving) & (turn < NUM_NEWTON + _NUM_DAMPED)
+
+    def advance(carry):
+        turn, guess, is_moving = carry
+        is_limited = jnp.where(turn > 0, 1.0, 0.0).astype(problem.mass.dtype)
+        found = newton_step(constant, guess, is_limited).solution
+        # What goes round in circles meets in the middle.
+        share = jnp.where(turn < NUM_NEWTON, 1.0, 0.5).astype(problem.mass.dtype)
+        twist = tuple(
+            v + share * (new - v)
+            for v, new in zip(guess.twist, found.twist, strict=True)
         )
-        moving = [
-            i
-            for i, r in enumerate(rates)
-            if not isinstance(r, jax.custom_derivatives.SymbolicZero)
-        ]
-
-        def residual(values):
-            full = list(leaves)
-            for i, value in zip(moving, values, strict=True):
-                full[i] = value
-            return _residual(jax.tree.unflatten(treedef, full), solution)
-
-        _, (out, tail) = jax.jvp(
-            residual, ([leaves[i] for i in moving],), ([rates[i] for i in moving],)
+        # The first has none before it that slipped.
+        x, y, spin = (
+            jnp.where(turn == 0, new, old)
+            for new, old in zip(twist, found.before, strict=True)
         )
-        tangent = _solve_linear(
-            problem,
-            slopes_of(problem, solution.twist),
-            tuple(-o for o in out),
-            [-t for t in tail],
+        found = found._replace(twist=twist, before=(x, y, spin))
+        has_moved = (turn == 0) | _has_moved(guess.twist, found.twist)
+        # Lanes that are done stay as they are, whatever the others do.
+        found = jax.tree.map(
+            lambda new, old: jnp.where(is_moving[None], new, old), found, guess
         )
-        return solution, tangent
+        return turn + 1, found, is_moving & has_moved
 
-    solve.defjvp(solve_jvp, symbolic_zeros=True)
-    return solve(problem)
+    is_moving = jnp.broadcast_to(_has_any(problem), (lanes,))
+    start = (jnp.zeros((), jnp.int32), guess, is_moving)
+    guess = jax.lax.while_loop(goes_on, advance, start)[1]
+    solved = newton_step(problem, jax.lax.stop_gradient(guess))
+    found = jax.lax.stop_gradient(solved.solution.twist)
+    is_moving = _has_any(problem) & _has_moved(guess.twist, found, _UNSETTLED)
+    return solved._replace(is_settled=~is_moving)
+
+
+def _has_any(problem: VelocityProblem) -> Bool[Array, " lane"]:
+    """Which lanes have friction, a motor or a limit at all."""
+    if problem.limits is not None:
+        return jnp.ones(problem.mass.shape[-1], bool)
+    frictions = [problem.contacts, problem.spins]
+    frictions += [None if problem.laws is None else problem.laws.friction]
+    viscous = jax.tree.leaves([f.viscous for f in frictions if f is not None])
+    found = [jnp.any(c > 0.0, axis=tuple(range(c.ndim - 1))) for c in viscous]
+    return functools.reduce(jnp.logical_or, found)
+
+
+def _has_moved(old: tuple, new: tuple, share: float | None = None) -> Array:
+    """Whether a lane's iterate changed by more than a share of it; else rounding."""
+    if share is None:
+        share = 64.0 * float(jnp.finfo(new[0].dtype).eps)
+    size = sum(jnp.max(jnp.abs(v), axis=0) for v in new)
+    change = functools.reduce(
+        jnp.maximum,
+        [jnp.max(jnp.abs(v - u), axis=0) for u, v in zip(old, new, strict=True)],
+    )
+    # A lane that is not finite does not hold up the others.
+    return change > share * size

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from boomdp_jax.physics.constraint_spec import JOINTS
 from boomdp_jax.physics.params import WORLD, Params
 from boomdp_jax.physics.scene_spec import SceneSpec
 from boomdp_jax.viz.style import BY_KIND, EDGE, WHEEL
@@ -14,10 +15,10 @@ WHEEL_SIZE = (0.4, 0.14)
 
 
 class Link(NamedTuple):
-    """A pin or a rod between two bodies, or a body and the world."""
+    """A joint between two bodies, or a body and the world."""
 
     kind: str
-    """`revolute` or `distance`."""
+    """Of a joint."""
     body_a: int
     body_b: int
     """Partner; `WORLD` for the world."""
@@ -68,8 +69,10 @@ def joint_marks(spec: SceneSpec, params: Params | None) -> JointMarks:
             f"densities of shape {params.density.shape}"
         )
     links = []
-    for kind in ("revolute", "distance"):
+    for kind in JOINTS:
         slots = getattr(params, kind)
+        if slots is None:
+            continue
         fields = (slots.body_a, slots.body_b, slots.anchor_a, slots.anchor_b)
         body_a, body_b, anchor_a, anchor_b = map(np.asarray, fields)
         links += [
@@ -108,7 +111,7 @@ def draw_joint_marks(
     for link in marks.links:
         colour = BY_KIND[link.kind]
         ends = np.stack(link_ends(link, poses))
-        if link.kind == "distance":
+        if link.kind in ("distance", "prismatic"):
             ax.plot(*ends.T, color=colour, linewidth=2, zorder=4)
         for end, body in zip(ends, (link.body_a, link.body_b), strict=True):
             if link.kind == "revolute" and body != WORLD:
@@ -195,7 +198,7 @@ def _known_marks(spec: SceneSpec) -> JointMarks:
     links, wheels = [], []
     for each in spec.constraints:
         numbers = each.numbers
-        if each.kind in ("revolute", "distance"):
+        if each.kind in JOINTS:
             anchors = numbers["anchor_a"], numbers["anchor_b"]
             if np.all(np.isfinite(anchors)):
                 links.append(Link(each.kind, each.body_a, each.body_b, *anchors))

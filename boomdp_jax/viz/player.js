@@ -150,7 +150,7 @@
     const colour = colours[link.kind];
     const ends = [toWorld(now[link.a], link.anchorA),
       link.b < 0 ? link.anchorB : toWorld(now[link.b], link.anchorB)];
-    if (link.kind === "distance") line(ends, colour, 2.5);
+    if (["distance", "prismatic"].includes(link.kind)) line(ends, colour, 2.5);
     ends.forEach((end, i) => {
       const body = [link.a, link.b][i];
       if (link.kind === "revolute" && body >= 0) line([now[body], end], colour, 1, 0.6);
@@ -340,7 +340,9 @@
   element("end").textContent = duration.toFixed(2);
   element("scrub").max = last;
   element("trail").checked = data.trail;
-  for (const [kind, words] of [["revolute", "pin"], ["distance", "rod"]]) {
+  for (const [kind, words] of [
+    ["revolute", "pin"], ["distance", "rod"], ["prismatic", "slide"], ["weld", "weld"],
+  ]) {
     if (links.some((link) => link.kind === kind)) addToLegend(colours[kind], words);
   }
   if (wheels.length) addToLegend(colours.wheel, "wheel");

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from boomdp_jax.core.atomic import atomic_write
+from boomdp_jax.physics.constraint_spec import JOINTS
 from boomdp_jax.viz.film import Film, nearest_states
 from boomdp_jax.viz.joint_marks import wheel_corners
 from boomdp_jax.viz.style import BODY, BY_KIND, EDGE, GRID, PREDICTION, STATIC, WHEEL
@@ -96,7 +97,7 @@ def film_data(film: Film) -> dict[str, Any]:
             for corners in wheel_corners(wheel, film.spec)
         ],
         "colours": {
-            **{kind: BY_KIND[kind] for kind in ("revolute", "distance")},
+            **{kind: BY_KIND[kind] for kind in JOINTS},
             "wheel": WHEEL,
             "body": BODY,
             "static": STATIC,

@@ -21,6 +21,13 @@ PREDICTION = "#0072B2"
 BASELINE = "#E69F00"
 """Orange."""
 
-BY_KIND = {"revolute": PIN, "distance": ROD, "wheel": WHEEL, "ground": FLOOR}
+BY_KIND = {
+    "revolute": PIN,
+    "distance": ROD,
+    "wheel": WHEEL,
+    "ground": FLOOR,
+    "prismatic": ROD,
+    "weld": PIN,
+}
 
 OUTLINE_STYLE = {"facecolor": BODY, "edgecolor": EDGE, "linewidth": 1.2, "zorder": 1}

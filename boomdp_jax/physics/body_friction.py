@@ -1,0 +1,204 @@
+r"""What the friction of wheels and floor does to every body, linearised at a twist.
+
+A body feels $-T^T f(\bar u)$; with the slope $K$ of $f$ at the iterate $\bar w$ its
+momentum balance is
+
+$$A (w - \bar w) = p - M \bar w - T_m^T f(\bar u), \qquad A = M + T_m^T K \vartheta
+  T_e,$$
+
+written as a correction since a stiff $K$ drowns $M$ in rounding: what is wrong with
+$A^{-1}$ then vanishes with what is left to correct. $T_m$ is taken at mid-step, where
+the force acts on average, and $T_e$ at the end of the substep, where a stiff contact
+must not slip. All arrays of public functions are in lanes.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from boomdp_jax.core.one_loop import elementwise
+from boomdp_jax.physics.friction import Contact, Spin, limited
+from boomdp_jax.physics.small_linear import dot3, inverse3, matvec3
+
+PerBody = Float[Array, "body lane"]
+
+# Points of friction that one loop takes: more make it slow to compile.
+_MOST_AT_ONCE = 6
+
+
+class Felt(NamedTuple):
+    """What friction depends on, of every body."""
+
+    frame: tuple
+    """Cosine and sine at mid-step."""
+    turn: tuple
+    """Cosine and sine of half the turn of the substep."""
+    start: tuple
+    """Twist at the start of the substep, world axes."""
+    twist: tuple
+    """The iterate."""
+    before: tuple
+    """In the iteration before."""
+
+
+class BodyAnswer(NamedTuple):
+    """A^-1: twist per impulse of every body, world axes."""
+
+    xx: Any
+    yy: Any
+    spin: Any
+    mixed: tuple = ()
+    """xy, yx, xs, sx, ys, sy; empty where they are zero."""
+
+    def __call__(self, x, y, moment) -> tuple:
+        """Answer to an impulse and its moment."""
+        if not self.mixed:
+            return self.xx * x, self.yy * y, self.spin * moment
+        xy, yx, xs, sx, ys, sy = self.mixed
+        return (
+            self.xx * x + xy * y + xs * moment,
+            yx * x + self.yy * y + ys * moment,
+            sx * x + sy * y + self.spin * moment,
+        )
+
+
+def friction_of_bodies(
+    contacts: Contact | None, spins: Spin | None, felt: Felt, is_limited: Any
+) -> tuple | None:
+    """A - M and - T^T f of every body, each in its own frame at mid-step.
+
+    Args:
+        contacts: `[contact, body, lane]`.
+        spins: `[spin, body, lane]`.
+        felt: twists.
+        is_limited: one, or zero to leave out the dry limits.
+
+    Returns:
+        Nine entries and three; None where there is no friction.
+    """
+    points = [] if contacts is None else _parts(contacts)
+    brakes = [] if spins is None else _parts(spins)
+    total = None
+    for first in range(0, max(len(points), 1 if brakes else 0), _MOST_AT_ONCE):
+        some = points[first : first + _MOST_AT_ONCE]
+        part = elementwise(
+            _friction, felt, some, brakes if first == 0 else [], is_limited
+        )
+        total = part if total is None else jax.tree.map(jnp.add, total, part)
+    return total
+
+
+def answer_of_bodies(
+    problem: Any, friction: tuple | None, twist: tuple, push: tuple
+) -> tuple[BodyAnswer, tuple]:
+    """A^-1, and the twists under impulses that are known.
+
+    Args:
+        problem: `velocity_solve.VelocityProblem`.
+        friction: from `friction_of_bodies`.
+        twist: the iterate.
+        push: impulse on every body beside its momentum.
+
+    Returns:
+        Both, world axes.
+    """
+    if friction is None:
+        light = problem.mobile / problem.mass
+        answer = BodyAnswer(light, light, problem.mobile / problem.inertia)
+        total = (p + q for p, q in zip(problem.momentum, push, strict=True))
+        return answer, answer(*total)
+    return elementwise(
+        _answer,
+        problem.mobile,
+        problem.mass,
+        problem.inertia,
+        tuple(p + q for p, q in zip(problem.momentum, push, strict=True)),
+        problem.frame,
+        friction,
+        twist,
+    )
+
+
+def _parts(stacked: Any) -> list:
+    num = jax.tree.leaves(stacked)[0].shape[0]
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], stacked) for i in range(num)]
+
+
+def _into(frame: tuple, twist: tuple) -> tuple:
+    """From the world's axes to a frame's."""
+    (cos, sin), (x, y, spin) = frame, twist
+    return cos * x + sin * y, cos * y - sin * x, spin
+
+
+def _friction(felt: Felt, points: list[Contact], brakes: list[Spin], is_limited):
+    """Of one body in scalars."""
+    start, now, before = (
+        _into(felt.frame, v) for v in (felt.start, felt.twist, felt.before)
+    )
+    cos, sin = felt.turn
+    # A twist at the start, half a turn before mid-step.
+    start = (cos * start[0] - sin * start[1], sin * start[0] + cos * start[1], start[2])
+    zero = jnp.zeros_like(cos)
+    a, b = [[zero] * 3 for _ in range(3)], [zero] * 3
+    for point in points:
+        rows = (point.rolling, point.lateral)
+        ends = [
+            (cos * row[0] - sin * row[1], sin * row[0] + cos * row[1], row[2])
+            for row in rows
+        ]
+        knee = tuple(k * is_limited for k in point.knee)
+
+        def seen(twist, ends=ends, rows=rows, point=point):
+            return tuple(
+                w * dot3(end, twist) + (1.0 - w) * dot3(row, start)
+                for w, end, row in zip(point.weight, ends, rows, strict=True)
+            )
+
+        u = seen(now)
+        scale, slope = limited(u, point.viscous, knee, seen(before))
+        for i, row in enumerate(rows):
+            k = [slope[i][j] * point.weight[j] for j in range(2)]
+            force = scale * point.viscous[i] * u[i]
+            for m in range(3):
+                b[m] = b[m] - row[m] * force
+                for n in range(3):
+                    a[m][n] = a[m][n] + row[m] * (k[0] * ends[0][n] + k[1] * ends[1][n])
+    for brake in brakes:
+        knee = brake.knee * is_limited
+        u, old = (
+            brake.weight * v[2] + (1.0 - brake.weight) * start[2] for v in (now, before)
+        )
+        scale, ((k,),) = limited((u,), (brake.viscous,), (knee,), (old,))
+        k = k * brake.weight
+        b[2] = b[2] - scale * brake.viscous * u
+        a[2][2] = a[2][2] + k
+    return a, b
+
+
+def _answer(mobile, mass, inertia, momentum, frame, friction, twist) -> tuple:
+    """Of one body in scalars."""
+    a, b = friction
+    a = [list(row) for row in a]
+    for i, own in enumerate((mass, mass, inertia)):
+        a[i][i] = a[i][i] + own
+    inverse = [[mobile * entry for entry in row] for row in inverse3(a)]
+    lacking = tuple(
+        p - m * v
+        for p, m, v in zip(momentum, (mass, mass, inertia), twist, strict=True)
+    )
+    rhs = [p + q for p, q in zip(_into(frame, lacking), b, strict=True)]
+    change = matvec3(inverse, rhs)
+    c, s = frame
+    (xx, xy, xs), (yx, yy, ys), (sx, sy, spin) = inverse
+    # R A^-1 R^T, column after column and then row after row.
+    xx, xy, yx, yy = c * xx - s * xy, s * xx + c * xy, c * yx - s * yy, s * yx + c * yy
+    sx, sy = c * sx - s * sy, s * sx + c * sy
+    xx, yx = c * xx - s * yx, s * xx + c * yx
+    xy, yy = c * xy - s * yy, s * xy + c * yy
+    xs, ys = c * xs - s * ys, s * xs + c * ys
+    answer = BodyAnswer(xx, yy, spin, (xy, yx, xs, sx, ys, sy))
+    x, y, turn = change
+    free = (twist[0] + c * x - s * y, twist[1] + s * x + c * y, twist[2] + turn)
+    return answer, free
