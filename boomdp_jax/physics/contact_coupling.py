@@ -37,6 +37,7 @@ from boomdp_jax.physics.prepare import Prepared
 from boomdp_jax.physics.small_linear import dot3, matvec3
 from boomdp_jax.physics.velocity_solve import (
     VelocityProblem,
+    answer_at,
     newton_step,
     solve_velocity,
 )
@@ -83,14 +84,13 @@ def coupled_substep(
     """
     num_bodies = motion.x.shape[0]
     problem = velocity_problem(prepared, motion, force)
-    solved = solve_velocity(problem)
-    is_settled = solved.is_settled
-    rate = 1.0 / prepared.length
     sums, impulses = touch.sums, touch.impulses
-    ease = _ease(problem, solved.answer)
-    twists = tuple(
-        v + dv for v, dv in zip(solved.solution.twist, ease(sums), strict=True)
-    )
+    # Under the impulses of the substep before: a body that is pushed along the floor
+    # slips, and answers to a change of them as one that does.
+    solved = solve_velocity(_pushed(problem, sums))
+    is_settled, twists = solved.is_settled, solved.solution.twist
+    ease = _ease(problem, answer_at(problem, twists))
+    rate = 1.0 / prepared.length
 
     def answered(twists, sums, before):
         """Friction and joints under the impulses of contacts."""
@@ -110,7 +110,7 @@ def coupled_substep(
         sums = both[3:]
         solved = answered(both[:3], sums, solved)
         twists = solved.solution.twist
-        ease = _ease(problem, solved.answer)
+        ease = _ease(problem, answer_at(problem, twists))
     place = moved_with(motion, _touches(sums), twists, prepared.length)
     both, impulses = settle_all(
         contacts,

@@ -178,6 +178,14 @@ def newton_step(
     return Solved(Solution((x, y, spin), guess.twist, impulse), answer, unknown)
 
 
+def answer_at(problem: VelocityProblem, twist: Twist) -> BodyAnswer:
+    """What bodies answer to an impulse when they move so, joints apart."""
+    felt = Felt(problem.frame, problem.turn, problem.start, twist, twist)
+    friction = friction_of_bodies(problem.contacts, problem.spins, felt, 1.0)
+    zero = jnp.zeros_like(problem.mass)
+    return answer_of_bodies(problem, friction, twist, (zero, zero, zero))[0]
+
+
 def coupled(end: Rows, push: Rows, columns: tuple) -> Float[Array, "row row lane"]:
     """J A^-1 J^T, given what pushes along the second do to their bodies."""
 
