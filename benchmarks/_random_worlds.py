@@ -131,7 +131,8 @@ def _outlines(draws: _Draws) -> tuple:
     corners = corners * size[:, None, None]
     cross, after = _crosses(corners)
     centre = jnp.sum(cross[..., None] * (corners + after), axis=1)
-    corners = corners - centre / (3.0 * jnp.sum(cross, axis=1))[:, None]
+    centre = centre / (3.0 * jnp.sum(cross, axis=1))[:, None]
+    corners = corners - centre[:, None]
     cross, after = _crosses(corners)
     area = 0.5 * jnp.sum(cross, axis=1)
     squares = jnp.sum(corners**2 + corners * after + after**2, axis=-1)

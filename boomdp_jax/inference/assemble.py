@@ -149,7 +149,8 @@ def _merge(
         whole,
     )
     fields: dict[str, dict[str, np.ndarray]] = {
-        kind: dict(vars(getattr(arrays, kind)))
+        # Ranges and motors, which inference does not know, are None.
+        kind: {k: v for k, v in vars(getattr(arrays, kind)).items() if v is not None}
         for kind in ("revolute", "distance", "wheel", "ground")
     }
     shape = (num_draws, spec.num_bodies)
@@ -169,6 +170,8 @@ def _merge(
             block_fields = vars(getattr(part, kind))
             count = block.layout.count(kind)
             for name, values in block_fields.items():
+                if name not in fields[kind]:
+                    continue
                 values = np.asarray(values)
                 if kind in first:
                     rows = slice(first[kind], first[kind] + count)

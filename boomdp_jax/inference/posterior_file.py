@@ -53,7 +53,7 @@ _PARAM_SHAPES = {
     "ground": ("body", "ground slot"),
 }
 _PAIRS = {
-    "revolute": ("anchor_a", "anchor_b"),
+    "revolute": ("anchor_a", "anchor_b", "limit", "motor"),
     "distance": ("anchor_a", "anchor_b"),
     "wheel": ("position", "viscous", "dry"),
     "ground": ("load_shift",),

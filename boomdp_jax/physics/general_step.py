@@ -36,6 +36,8 @@ from boomdp_jax.physics.velocity_solve import (
 # Most that a row may change from mid-step to the end of a substep, squared and relative
 # in the metric of the masses: as much as a lever that turns by a quarter of a radian.
 _MOST_CHANGE = 0.06
+# Turn [rad] of a body in a substep from which its joints are not right at its end.
+_MOST_TURN = 0.4
 
 
 def velocity_problem(
@@ -241,7 +243,7 @@ def projected(
     end, is_far = project(prepared, end)
     is_right = is_settled & ~is_far
     if problem.is_steady is not None:
-        is_right = is_right & problem.is_steady
+        is_right = is_right & problem.is_steady & ~_is_fast(prepared, problem, end)
     half_mass = 0.5 * prepared.mobile * prepared.mass
     half_inertia = 0.5 * prepared.mobile * prepared.inertia
 
@@ -267,6 +269,18 @@ def projected(
     root = jnp.sqrt(jnp.where(has_ratio, ratio, 1.0))
     scale = jnp.where(is_much, jnp.where(has_ratio, root, 0.0), 1.0)[None]
     return end._replace(vx=scale * end.vx, vy=scale * end.vy, spin=scale * end.spin)
+
+
+def _is_fast(
+    prepared: Prepared, problem: VelocityProblem, end: Motion
+) -> Bool[Array, " lane"]:
+    """Whether a body with a joint ends up turning too far in a substep."""
+    rows: Any = problem.rows_mid
+    ease: Any = problem.ease
+    spin = jnp.abs(jax.lax.stop_gradient(end.spin))
+    spin = jnp.maximum(of_body(rows.a, spin), of_body(rows.b, spin))
+    is_far = prepared.length[None] * spin > _MOST_TURN
+    return jnp.any(is_far & (ease > 0.0), axis=0)
 
 
 def _motor_work(prepared: Prepared, problem: VelocityProblem, end: Motion):
