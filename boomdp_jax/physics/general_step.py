@@ -38,6 +38,9 @@ from boomdp_jax.physics.velocity_solve import (
 _MOST_CHANGE = 0.06
 # Turn [rad] of a body in a substep from which its joints are not right at its end.
 _MOST_TURN = 0.4
+# So many times its kinetic energy no substep adds to it out of nothing. Less than that
+# a sweep over contacts may, while the impulses of an impact find their place.
+_MOST_GAIN = 3.0
 
 
 def velocity_problem(
@@ -226,8 +229,9 @@ def projected(
 
     Where bodies turn so far in a substep that the rows of their joints are not what
     they were (`_steadied`), or come far off them, or where Newton's method has not come
-    to rest, a step is wrong whatever it does. Twists are then scaled down, which joints
-    do not notice, to the kinetic energy at the start and the work of forces and motors.
+    to rest, or a contact kicks what joints hold, a step is wrong whatever it does.
+    Twists are then scaled down, which joints do not notice, to the kinetic energy at
+    the start and the work of forces and motors.
 
     Args:
         prepared: what does not depend on the state.
@@ -258,11 +262,14 @@ def projected(
         jnp.sum(prepared.mobile * f * (new - old), axis=0)
         for f, new, old in zip(forces, end[:3], start[:3], strict=True)
     )
-    allowed = jnp.maximum(
-        kinetic(start) + work + _motor_work(prepared, problem, end), 0
-    )
-    present = kinetic(end)
-    is_much = ~is_right & (present > allowed)
+    motors = _motor_work(prepared, problem, end)
+    first, present = kinetic(start), kinetic(end)
+    allowed = jnp.maximum(first + work + motors, 0.0)
+    # Overlapping bodies may be moved up without being paid for it.
+    most = first + jnp.maximum(work, 0.0) + motors
+    is_kicked = present > (1.0 + _MOST_GAIN) * most
+    allowed = jnp.where(is_right, most, allowed)
+    is_much = (~is_right | is_kicked) & (present > allowed)
     ratio = allowed / jnp.where(is_much, present, 1.0)
     # No derivative of the root of nothing.
     has_ratio = is_much & (ratio > 0.0)
