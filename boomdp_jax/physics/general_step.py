@@ -16,15 +16,13 @@ from boomdp_jax.physics.joints import (
     Frames,
     Rows,
     bilateral_rows,
-    join_rows,
+    join,
     of_body,
-    slide_rows,
     speed,
-    turn_rows,
 )
 from boomdp_jax.physics.motion import Motion
 from boomdp_jax.physics.prepare import Drive, Prepared
-from boomdp_jax.physics.projection import ease_of, project
+from boomdp_jax.physics.projection import drive_rows, ease_of, project
 from boomdp_jax.physics.trigonometry import rotated, sincos
 from boomdp_jax.physics.velocity_solve import (
     Laws,
@@ -164,13 +162,7 @@ def _drives(
 ) -> tuple[Laws | None, Limits | None]:
     """What acts along the coordinates that joints leave free."""
     laws, limits = [], []
-    for drive, rows_of in (
-        (prepared.turning, turn_rows),
-        (prepared.sliding, slide_rows),
-    ):
-        if drive is None:
-            continue
-        rows: Any = rows_of(prepared.joints, middle)
+    for drive, rows in drive_rows(prepared, middle):
         moving = speed(rows, start)
         for spin, target in ((drive.friction, None), (drive.motor, drive.target)):
             if spin is not None:
@@ -178,7 +170,7 @@ def _drives(
                 laws.append(Laws(rows, Spin(*spin), moving, aim))
         if drive.lower is not None:
             limits.append(_range(prepared, drive, rows, moving))
-    return join_rows(*laws), join_rows(*limits)
+    return join(*laws), join(*limits)
 
 
 def _range(prepared: Prepared, drive: Drive, rows: Rows, moving) -> Limits:
@@ -188,7 +180,7 @@ def _range(prepared: Prepared, drive: Drive, rows: Rows, moving) -> Limits:
     further.
     """
     length = prepared.length[None]
-    # The error of these rows is the coordinate itself, at mid-step.
+    # The coordinate is that at mid-step.
     place = rows.error - 0.5 * length * moving
     lower: Any = drive.lower
     upper: Any = drive.upper

@@ -118,10 +118,10 @@ def joints_of(params: Params, dtype) -> Joints:
         angle.append(params.prismatic.angle)
         axis = (jnp.cos(params.prismatic.axis), jnp.sin(params.prismatic.axis))
     return Joints(
-        points=_joined(pins, welds),
+        points=join(pins, welds),
         rods=rods,
         length=None if rods is None else params.distance.length,
-        angles=_joined(welds, guides),
+        angles=join(welds, guides),
         angle=jnp.concatenate(angle) if angle else None,
         guides=guides,
         axis=axis,
@@ -129,15 +129,12 @@ def joints_of(params: Params, dtype) -> Joints:
     )
 
 
-def _joined(*parts: Any) -> Any:
+def join(*parts: Any) -> Any:
     """One after another along the first axis, of those that are there."""
     parts = tuple(part for part in parts if part is not None)
     if not parts:
         return None
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
-
-
-join_rows = _joined
 
 
 def of_body(index: PerRow, values: Any) -> Any:
@@ -226,7 +223,7 @@ def bilateral_rows(joints: Joints, frames: Frames) -> Rows | None:
             continue
         found = elementwise(function, _placed(ends, frames), *more)
         parts += [Rows(ends.a, ends.b, *row) for row in found]
-    return _joined(*parts)
+    return join(*parts)
 
 
 def turn_rows(joints: Joints, frames: Frames) -> Rows | None:

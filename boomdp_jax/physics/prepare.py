@@ -148,6 +148,7 @@ def prepare_world(
     length = bodies.length
     if scene.area.shape[0] == 1:
         bodies = jax.tree.map(lambda leaf: leaf[..., None, :], bodies)
+        bodies = bodies._replace(length=length)
     joints = joints_of(params, bodies.mass.dtype)
     turning = sliding = None
     if joints.turns is not None:
@@ -157,18 +158,7 @@ def prepare_world(
     if joints.guides is not None and params.prismatic is not None:
         ease = _both(joints.guides, bodies.mobile / bodies.mass)
         sliding = _drive(params.prismatic, ease, length, True)
-    return Prepared(
-        length=length,
-        mobile=bodies.mobile,
-        mass=bodies.mass,
-        inertia=bodies.inertia,
-        weight=bodies.weight,
-        contacts=bodies.contacts,
-        spins=bodies.spins,
-        joints=joints,
-        turning=turning,
-        sliding=sliding,
-    )
+    return Prepared(*bodies, joints, turning, sliding)
 
 
 def prepare_bodies(

@@ -16,14 +16,14 @@ from boomdp_jax.physics.joints import (
     Frames,
     Rows,
     bilateral_rows,
-    join_rows,
+    join,
     of_body,
     slide_rows,
     speed,
     turn_rows,
 )
 from boomdp_jax.physics.motion import Motion
-from boomdp_jax.physics.prepare import Prepared
+from boomdp_jax.physics.prepare import Drive, Prepared
 from boomdp_jax.physics.small_linear import solve_in_lanes
 from boomdp_jax.physics.trigonometry import sincos
 from boomdp_jax.physics.velocity_solve import (
@@ -66,6 +66,25 @@ def has_rows(prepared: Prepared) -> bool:
     """Whether there is any joint."""
     joints = prepared.joints
     return any(e is not None for e in (joints.points, joints.rods, joints.angles))
+
+
+def drive_rows(prepared: Prepared, frames: Frames) -> list[tuple[Drive, Rows]]:
+    """What acts along coordinates that joints leave free, and rows of these.
+
+    Args:
+        prepared: what does not depend on the state.
+        frames: where the bodies are.
+
+    Returns:
+        Of each kind; the error of its rows is the coordinate itself.
+    """
+    kinds = ((prepared.turning, turn_rows), (prepared.sliding, slide_rows))
+    pairs: list[Any] = [
+        (drive, rows_of(prepared.joints, frames))
+        for drive, rows_of in kinds
+        if drive is not None
+    ]
+    return pairs
 
 
 def project(prepared: Prepared, motion: Motion) -> tuple[Motion, Bool[Array, " lane"]]:
@@ -153,13 +172,9 @@ def _rows(
     """
     rows = bilateral_rows(prepared.joints, frames)
     parts, counts = [rows], [None if rows is None else jnp.ones_like(rows.error)]
-    for drive, rows_of in (
-        (prepared.turning, turn_rows),
-        (prepared.sliding, slide_rows),
-    ):
-        if drive is None or drive.lower is None:
+    for drive, row in drive_rows(prepared, frames):
+        if drive.lower is None:
             continue
-        row: Any = rows_of(prepared.joints, frames)
         lower: Any = drive.lower
         upper: Any = drive.upper
         below, above = row.error - lower, row.error - upper
@@ -173,7 +188,7 @@ def _rows(
         counts.append((is_below | is_above).astype(row.error.dtype))
         parts.append(row._replace(error=jnp.where(is_below, below, above)))
     counts = [count for count in counts if count is not None]
-    return join_rows(*parts), join_rows(*counts)
+    return join(*parts), join(*counts)
 
 
 def _columns(prepared: Prepared, rows: Rows) -> tuple:

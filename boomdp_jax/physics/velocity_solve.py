@@ -42,7 +42,7 @@ from boomdp_jax.physics.body_friction import (
     friction_of_bodies,
 )
 from boomdp_jax.physics.friction import NUM_NEWTON, Contact, Spin, limited
-from boomdp_jax.physics.joints import Rows, join_rows, of_body, speed, to_bodies
+from boomdp_jax.physics.joints import Rows, join, of_body, speed, to_bodies
 from boomdp_jax.physics.small_linear import solve_in_lanes
 
 # Iterations, beside `NUM_NEWTON`, for the few that have not come to rest by then.
@@ -268,8 +268,8 @@ def _system(problem: VelocityProblem, guess: Solution, is_limited) -> tuple:
             whole.append(part)
         needs.append(parts[0] > 0.0)
     return (
-        join_rows(*push),
-        join_rows(*end),
+        join(*push),
+        join(*end),
         *(jnp.concatenate(parts) for parts in (gain, diagonal, demand, needs)),
     )
 

@@ -120,7 +120,8 @@ def _rollout(
     if length.ndim == 1:
         world = _world(scene, params, length)
         return _rollout_of(*sizes, world, state, wrenches, None)
-    start, contact = _start(state, None, _world(scene, params, length[0]).contact)
+    contact = _world(scene, params, length[0]).contact
+    start = _start(state, None, contact)
 
     def advance(carry, inputs):
         wrench, step_length = inputs
@@ -134,7 +135,7 @@ def _rollout_of(
     num_substeps: int, num_sweeps: int, world: World, state: State, wrenches, cache
 ) -> tuple[tuple, Any]:
     """The same with one length for all steps."""
-    start, _ = _start(state, cache, world.contact)
+    start = _start(state, cache, world.contact)
 
     def advance(carry, wrench):
         return _advance((num_substeps, num_sweeps), world, carry, wrench)
@@ -147,7 +148,7 @@ def _start(state: State, cache: Any, contact: ContactWorld | None) -> tuple:
     impulses = None
     if contact is not None:
         impulses = _impulses(cache, motion.x.shape[0], motion.x)
-    return (motion, impulses), contact
+    return motion, impulses
 
 
 def _scanned(advance, start: tuple, inputs: Any) -> tuple[tuple, Any]:

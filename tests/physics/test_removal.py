@@ -85,6 +85,18 @@ def test_a_removed_body_is_not_there_and_nothing_is_traced_again():
             )
 
 
+def test_a_removed_body_might_as_well_be_far_away():
+    spec, gone = make_spec(ALL), ALL.index("low")
+    scene, params = remove_bodies(
+        spec.scene, spec.params(), jnp.arange(len(ALL)) == gone
+    )
+    start = spec.initial_state()
+    away = State(start.pose.at[gone, :2].set(500.0), start.twist)
+    move = jax.jit(lambda state: run(scene, params, state))
+    others = [i for i in range(len(ALL)) if i != gone]
+    np.testing.assert_array_equal(move(start)[:, others], move(away)[:, others])
+
+
 def test_structures_are_masks_and_nothing_is_traced_again():
     spec = make_spec(("bar",))
     num_traces = 0
