@@ -126,8 +126,8 @@ def _parts(stacked: Any) -> list:
     return [jax.tree.map(lambda leaf, i=i: leaf[i], stacked) for i in range(num)]
 
 
-def _into(frame: tuple, twist: tuple) -> tuple:
-    """From the world's axes to a frame's."""
+def into_frame(frame: tuple, twist: tuple) -> tuple:
+    """A twist in a frame's axes, of one in the world's."""
     (cos, sin), (x, y, spin) = frame, twist
     return cos * x + sin * y, cos * y - sin * x, spin
 
@@ -135,7 +135,7 @@ def _into(frame: tuple, twist: tuple) -> tuple:
 def _friction(felt: Felt, points: list[Contact], brakes: list[Spin], is_limited):
     """Of one body in scalars."""
     start, now, before = (
-        _into(felt.frame, v) for v in (felt.start, felt.twist, felt.before)
+        into_frame(felt.frame, v) for v in (felt.start, felt.twist, felt.before)
     )
     cos, sin = felt.turn
     # A twist at the start, half a turn before mid-step.
@@ -188,7 +188,7 @@ def _answer(mobile, mass, inertia, momentum, frame, friction, twist) -> tuple:
         p - m * v
         for p, m, v in zip(momentum, (mass, mass, inertia), twist, strict=True)
     )
-    rhs = [p + q for p, q in zip(_into(frame, lacking), b, strict=True)]
+    rhs = [p + q for p, q in zip(into_frame(frame, lacking), b, strict=True)]
     change = matvec3(inverse, rhs)
     c, s = frame
     (xx, xy, xs), (yx, yy, ys), (sx, sy, spin) = inverse

@@ -24,12 +24,8 @@ from boomdp_jax.physics.motion import Motion
 from boomdp_jax.physics.prepare import Drive, Prepared
 from boomdp_jax.physics.projection import drive_rows, ease_of, project
 from boomdp_jax.physics.trigonometry import rotated, sincos
-from boomdp_jax.physics.velocity_solve import (
-    Laws,
-    Limits,
-    VelocityProblem,
-    solve_velocity,
-)
+from boomdp_jax.physics.velocity_search import solve_velocity
+from boomdp_jax.physics.velocity_solve import Laws, Limits, VelocityProblem
 
 # Most that a row may change from mid-step to the end of a substep, squared and relative
 # in the metric of the masses: as much as a lever that turns by a quarter of a radian.

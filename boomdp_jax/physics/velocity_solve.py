@@ -8,15 +8,11 @@ $$M w = p - h\,T^T f(\bar u) + J_m^T \lambda, \qquad J_e w = 0, \qquad
 $J_m$ taken at mid-step, where the impulse acts on average, and $J_e$ at its end, where
 the joint must hold. The friction, motor and limits of a joint are rows as well,
 $\lambda = -f(J\bar w - u_{motor})$ and $\lambda \ge 0 \perp J w \ge u_{limit}$.
-Newton's method starts from the solution in which everything sticks: from there a
-contact that slips is left on its own side, and one that sticks is already solved. Each
-iteration eliminates the bodies and solves the rows directly:
+Newton's method is applied (`velocity_search`); each iteration eliminates the bodies and
+solves the rows directly:
 
 $$A = M + h\,T^T K \vartheta T, \qquad (J_e A^{-1} J_m^T + \epsilon)\,\lambda = -J_e
   A^{-1} b.$$
-
-Derivatives are those of the last iteration with what it starts from held constant,
-which at the solution is the implicit function theorem, in both modes.
 
 Compared on a body with pin and wheel, against two-stage L-stable Runge-Kutta (twice the
 cost, and dry friction then overshoots at the moment of stopping by up to half of a
@@ -26,10 +22,8 @@ the error of a wheel's decay).
 All arrays are in lanes (`core.lanes`), twists and rows in world axes.
 """
 
-import functools
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -41,14 +35,9 @@ from boomdp_jax.physics.body_friction import (
     answer_of_bodies,
     friction_of_bodies,
 )
-from boomdp_jax.physics.friction import NUM_NEWTON, Contact, Spin, limited
+from boomdp_jax.physics.friction import Contact, Spin, limited
 from boomdp_jax.physics.joints import Rows, join, of_body, speed, to_bodies
 from boomdp_jax.physics.small_linear import solve_in_lanes
-
-# Iterations, beside `NUM_NEWTON`, for the few that have not come to rest by then.
-_NUM_DAMPED = 12
-# Relative change in the last iteration from which it has not.
-_UNSETTLED = 1e-3
 
 PerBody = Float[Array, "body lane"]
 PerRow = Float[Array, "row lane"]
@@ -178,14 +167,6 @@ def newton_step(
     return Solved(Solution((x, y, spin), guess.twist, impulse), answer, unknown)
 
 
-def answer_at(problem: VelocityProblem, twist: Twist) -> BodyAnswer:
-    """What bodies answer to an impulse when they move so, joints apart."""
-    felt = Felt(problem.frame, problem.turn, problem.start, twist, twist)
-    friction = friction_of_bodies(problem.contacts, problem.spins, felt, 1.0)
-    zero = jnp.zeros_like(problem.mass)
-    return answer_of_bodies(problem, friction, twist, (zero, zero, zero))[0]
-
-
 def coupled(end: Rows, push: Rows, columns: tuple) -> Float[Array, "row row lane"]:
     """J A^-1 J^T, given what pushes along the second do to their bodies."""
 
@@ -247,7 +228,7 @@ def _system(problem: VelocityProblem, guess: Solution, is_limited) -> tuple:
         laws = problem.laws
         seen = speed(laws.rows, guess.twist), speed(laws.rows, guess.before)
         slope, offset = elementwise(
-            _law, laws.friction, laws.start, laws.target, *seen, is_limited
+            law_line, laws.friction, laws.start, laws.target, *seen, is_limited
         )
         push.append(laws.rows)
         end.append(laws.rows)
@@ -274,8 +255,8 @@ def _system(problem: VelocityProblem, guess: Solution, is_limited) -> tuple:
     )
 
 
-def _law(spin: Spin, start, target, now, before, is_limited) -> tuple:
-    """Slope of a friction and its demand: lambda + slope J w = demand."""
+def law_line(spin: Spin, start, target, now, before, is_limited) -> tuple:
+    """Slope of a friction and its demand: lambda + slope J w = demand; in scalars."""
 
     def blend(value):
         return spin.weight * value + (1.0 - spin.weight) * start - target
@@ -299,80 +280,3 @@ def _limit(least, most, ease, now, pressure) -> tuple:
         jnp.where(is_held, softness, one),
         jnp.where(is_held, jnp.where(is_least, least, most), zero),
     )
-
-
-def solve_velocity(problem: VelocityProblem) -> Solved:
-    """Solve one velocity update.
-
-    Args:
-        problem: momenta, frictions and joint rows.
-
-    Returns:
-        Twists and impulses.
-    """
-    guess = first_guess(problem)
-    has_friction = problem.contacts is not None or problem.spins is not None
-    if not has_friction and problem.laws is None and problem.limits is None:
-        return newton_step(problem, guess)
-    constant = jax.lax.stop_gradient(problem)
-
-    lanes = problem.mass.shape[-1]
-
-    def goes_on(carry):
-        turn, _, is_moving = carry
-        return jnp.any(is_moving) & (turn < NUM_NEWTON + _NUM_DAMPED)
-
-    def advance(carry):
-        turn, guess, is_moving = carry
-        is_limited = jnp.where(turn > 0, 1.0, 0.0).astype(problem.mass.dtype)
-        found = newton_step(constant, guess, is_limited).solution
-        # What goes round in circles meets in the middle.
-        share = jnp.where(turn < NUM_NEWTON, 1.0, 0.5).astype(problem.mass.dtype)
-        twist = tuple(
-            v + share * (new - v)
-            for v, new in zip(guess.twist, found.twist, strict=True)
-        )
-        # The first has none before it that slipped.
-        x, y, spin = (
-            jnp.where(turn == 0, new, old)
-            for new, old in zip(twist, found.before, strict=True)
-        )
-        found = found._replace(twist=twist, before=(x, y, spin))
-        has_moved = (turn == 0) | _has_moved(guess.twist, found.twist)
-        # Lanes that are done stay as they are, whatever the others do.
-        found = jax.tree.map(
-            lambda new, old: jnp.where(is_moving[None], new, old), found, guess
-        )
-        return turn + 1, found, is_moving & has_moved
-
-    is_moving = jnp.broadcast_to(_has_any(problem), (lanes,))
-    start = (jnp.zeros((), jnp.int32), guess, is_moving)
-    guess = jax.lax.while_loop(goes_on, advance, start)[1]
-    solved = newton_step(problem, jax.lax.stop_gradient(guess))
-    found = jax.lax.stop_gradient(solved.solution.twist)
-    is_moving = _has_any(problem) & _has_moved(guess.twist, found, _UNSETTLED)
-    return solved._replace(is_settled=~is_moving)
-
-
-def _has_any(problem: VelocityProblem) -> Bool[Array, " lane"]:
-    """Which lanes have friction, a motor or a limit at all."""
-    if problem.limits is not None:
-        return jnp.ones(problem.mass.shape[-1], bool)
-    frictions = [problem.contacts, problem.spins]
-    frictions += [None if problem.laws is None else problem.laws.friction]
-    viscous = jax.tree.leaves([f.viscous for f in frictions if f is not None])
-    found = [jnp.any(c > 0.0, axis=tuple(range(c.ndim - 1))) for c in viscous]
-    return functools.reduce(jnp.logical_or, found)
-
-
-def _has_moved(old: tuple, new: tuple, share: float | None = None) -> Array:
-    """Whether a lane's iterate changed by more than a share of it; else rounding."""
-    if share is None:
-        share = 64.0 * float(jnp.finfo(new[0].dtype).eps)
-    size = sum(jnp.max(jnp.abs(v), axis=0) for v in new)
-    change = functools.reduce(
-        jnp.maximum,
-        [jnp.max(jnp.abs(v - u), axis=0) for u, v in zip(old, new, strict=True)],
-    )
-    # A lane that is not finite does not hold up the others.
-    return change > share * size

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import boomdp_jax.physics.prepare as preparation
-import boomdp_jax.physics.velocity_solve as general
+import boomdp_jax.physics.velocity_search as general
 from boomdp_jax.physics import Params, State, step
 from boomdp_jax.physics.params import Distance, Ground, Revolute, Wheel
 from tests.physics.scenes import make_scene

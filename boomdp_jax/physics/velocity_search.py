@@ -1,0 +1,215 @@
+r"""Newton's method for the implicit velocity update, until it comes to rest.
+
+It starts from the solution in which everything sticks: from there a contact that slips
+is left on its own side, and one that sticks is already solved. After `NUM_NEWTON`
+iterations few are left; in these, each step ends where nothing is left to gain along
+it.
+
+Derivatives are those of the last iteration with what it starts from held constant,
+which at the solution is the implicit function theorem, in both modes.
+
+All arrays are in lanes (`core.lanes`).
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from boomdp_jax.core.one_loop import elementwise
+from boomdp_jax.physics.body_friction import Felt, friction_of_bodies, into_frame
+from boomdp_jax.physics.friction import NUM_NEWTON
+from boomdp_jax.physics.joints import speed
+from boomdp_jax.physics.velocity_solve import (
+    Solution,
+    Solved,
+    VelocityProblem,
+    first_guess,
+    law_line,
+    newton_step,
+)
+
+# Iterations, beside `NUM_NEWTON`, for the few that have not come to rest by then.
+_NUM_DAMPED = 12
+# Evaluations with which the end of one of them is found.
+_NUM_NARROWED = 5
+# Relative change in the last iteration from which it has not.
+_UNSETTLED = 1e-3
+
+
+def solve_velocity(problem: VelocityProblem) -> Solved:
+    """Solve one velocity update.
+
+    Args:
+        problem: momenta, frictions and joint rows.
+
+    Returns:
+        Twists and impulses.
+    """
+    unknown = jnp.ones(problem.mass.shape[-1], bool)
+    return _iterated(problem, first_guess(problem), unknown, 0)
+
+
+def solve_again(
+    problem: VelocityProblem, found: Solution, has_changed: Bool[Array, " lane"]
+) -> Solved:
+    """Solve a velocity update of which one with other momenta has been solved.
+
+    Args:
+        problem: momenta, frictions and joint rows.
+        found: the solution with other momenta.
+        has_changed: where they differ.
+
+    Returns:
+        Twists and impulses.
+    """
+    guess = found._replace(before=found.twist)
+    return _iterated(problem, guess, has_changed, 1)
+
+
+def _iterated(
+    problem: VelocityProblem, guess: Solution, is_open: Bool[Array, " lane"], turn: int
+) -> Solved:
+    """Newton's method; in the first turn of all, everything sticks."""
+    has_friction = problem.contacts is not None or problem.spins is not None
+    if not has_friction and problem.laws is None and problem.limits is None:
+        return newton_step(problem, guess)
+    constant = jax.lax.stop_gradient(problem)
+
+    def goes_on(carry):
+        turn, _, is_moving = carry
+        return jnp.any(is_moving) & (turn < NUM_NEWTON + _NUM_DAMPED)
+
+    def advance(carry):
+        turn, guess, is_moving = carry
+        is_limited = jnp.where(turn > 0, 1.0, 0.0).astype(problem.mass.dtype)
+        is_late = turn >= NUM_NEWTON
+        # What goes beyond rest does so no further than is good for it, so that nothing
+        # is taken to stick for that.
+        before = tuple(
+            jnp.where(is_late, now, old)
+            for now, old in zip(guess.twist, guess.before, strict=True)
+        )
+        guess = guess._replace(before=before)
+        found = newton_step(constant, guess, is_limited).solution
+        share = jax.lax.cond(is_late, _good_share, _whole, constant, guess, found)
+        share = share[None]
+        twist = tuple(
+            v + share * (new - v)
+            for v, new in zip(guess.twist, found.twist, strict=True)
+        )
+        # The first has none before it that slipped.
+        x, y, spin = (
+            jnp.where(turn == 0, new, old)
+            for new, old in zip(twist, found.before, strict=True)
+        )
+        found = found._replace(twist=twist, before=(x, y, spin))
+        has_moved = (turn == 0) | _has_moved(guess.twist, found.twist)
+        # Lanes that are done stay as they are, whatever the others do.
+        found = jax.tree.map(
+            lambda new, old: jnp.where(is_moving[None], new, old), found, guess
+        )
+        return turn + 1, found, is_moving & has_moved
+
+    start = jax.lax.stop_gradient(guess)
+    start = (jnp.asarray(turn, jnp.int32), start, _has_any(problem) & is_open)
+    guess = jax.lax.while_loop(goes_on, advance, start)[1]
+    solved = newton_step(problem, jax.lax.stop_gradient(guess))
+    found = jax.lax.stop_gradient(solved.solution.twist)
+    is_moving = _has_any(problem) & _has_moved(guess.twist, found, _UNSETTLED)
+    return solved._replace(is_settled=~is_moving)
+
+
+def _whole(problem: VelocityProblem, guess: Solution, found: Solution) -> Array:
+    del problem, found
+    return jnp.ones_like(guess.twist[0][0])
+
+
+def _good_share(problem: VelocityProblem, guess: Solution, found: Solution) -> Array:
+    """Share of a Newton step after which nothing is left to gain along it.
+
+    Friction resists the more the faster it is sheared, so that what is lacking of the
+    momentum balance, taken along the step, changes sign once: at a minimum, where all
+    friction has a potential. Steps that end there cannot go round in circles.
+    """
+    step = tuple(v - u for u, v in zip(guess.twist, found.twist, strict=True))
+
+    def narrow(turn, ends):
+        low, high, at_low, at_high = ends
+        share = jnp.clip(_secant(*ends), 0.05, 0.95)
+        share = low + (high - low) * share
+        # Both ends come first.
+        share = jnp.where(turn == 0, 0.0, jnp.where(turn == 1, 1.0, share))
+        value = _lacking_along(problem, guess.twist, step, share[None])
+        is_low = (turn == 0) | ((turn != 1) & (value < 0.0))
+        return (
+            jnp.where(is_low, share, low),
+            jnp.where(is_low, high, share),
+            jnp.where(is_low, value, at_low),
+            jnp.where(is_low, at_high, value),
+        )
+
+    zero = jnp.zeros_like(step[0][0])
+    ends = (zero, zero + 1.0, zero, zero)
+    ends = jax.lax.fori_loop(0, _NUM_NARROWED, narrow, ends)
+    low, high, _, at_high = ends
+    share = low + (high - low) * jnp.clip(_secant(*ends), 0.0, 1.0)
+    return jnp.where(at_high <= 0.0, 1.0, share)
+
+
+def _secant(low, high, at_low, at_high) -> Array:
+    """Where between two ends a line through their values is zero; else half-way."""
+    del low, high
+    gap = at_high - at_low
+    return jnp.where(gap > 0.0, -at_low / jnp.where(gap > 0.0, gap, 1.0), 0.5)
+
+
+def _lacking_along(problem: VelocityProblem, start: tuple, step: tuple, share) -> Array:
+    """What is lacking of the momentum balance after a part of a step, along the step.
+
+    What joints do does no work along it and is left out.
+    """
+    twist = tuple(u + share * d for u, d in zip(start, step, strict=True))
+    felt = Felt(problem.frame, problem.turn, problem.start, twist, twist)
+    friction = friction_of_bodies(problem.contacts, problem.spins, felt, 1.0)
+    inertia = (problem.mass, problem.mass, problem.inertia)
+    parts = [
+        d * (m * v - p)
+        for d, m, v, p in zip(step, inertia, twist, problem.momentum, strict=True)
+    ]
+    if friction is not None:
+        along = into_frame(problem.frame, step)
+        parts += [-d * f for d, f in zip(along, friction[1], strict=True)]
+    if problem.laws is not None:
+        laws = problem.laws
+        moving = speed(laws.rows, twist)
+        slope, offset = elementwise(
+            law_line, laws.friction, laws.start, laws.target, moving, moving, 1.0
+        )
+        parts.append(speed(laws.rows, step) * (slope * moving - offset))
+    return functools.reduce(jnp.add, [jnp.sum(part, axis=0) for part in parts])
+
+
+def _has_any(problem: VelocityProblem) -> Bool[Array, " lane"]:
+    """Which lanes have friction, a motor or a limit at all."""
+    if problem.limits is not None:
+        return jnp.ones(problem.mass.shape[-1], bool)
+    frictions = [problem.contacts, problem.spins]
+    frictions += [None if problem.laws is None else problem.laws.friction]
+    viscous = jax.tree.leaves([f.viscous for f in frictions if f is not None])
+    found = [jnp.any(c > 0.0, axis=tuple(range(c.ndim - 1))) for c in viscous]
+    return functools.reduce(jnp.logical_or, found)
+
+
+def _has_moved(old: tuple, new: tuple, share: float | None = None) -> Array:
+    """Whether a lane's iterate changed by more than a share of it; else rounding."""
+    if share is None:
+        share = 64.0 * float(jnp.finfo(new[0].dtype).eps)
+    size = sum(jnp.max(jnp.abs(v), axis=0) for v in new)
+    change = functools.reduce(
+        jnp.maximum,
+        [jnp.max(jnp.abs(v - u), axis=0) for u, v in zip(old, new, strict=True)],
+    )
+    # A lane that is not finite does not hold up the others.
+    return change > share * size
