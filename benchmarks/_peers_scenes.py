@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable
 
 import _repository  # noqa: F401
@@ -26,6 +27,8 @@ WHEEL = {
 }
 NUM_BOXES, ROOM = 10, 2.4
 """How many boxes, and the side of the square room they are in [m]."""
+NUM_LINKS, LINK = 10, (0.1, 0.03)
+"""How many links a chain has, and their half extents [m]."""
 NUM_JUDGED = 16
 """Worlds whose overlaps are measured."""
 
@@ -52,8 +55,8 @@ def all_cases(*, is_quick: bool = False) -> list[Case]:
             second; a program for ten boxes takes long to compile.
 
     Returns:
-        One body with a pin, and with a pin and a wheel; a pendulum; ten boxes in a
-        room, flying and piling up.
+        One body with a pin, and with a pin and a wheel; a pendulum; a chain of ten
+        links; ten boxes in a room, flying and piling up.
     """
     few, many = (1, 64, 1024), (1, 64, 1024, 4096)
     box_steps = 300
@@ -69,6 +72,11 @@ def all_cases(*, is_quick: bool = False) -> list[Case]:
         ),
         Case("pendulum, 300 steps", pendulum, 300, _hanging, _judge_pendulum, many),
     ]
+    if not is_quick:
+        chain = _chain()
+        cases.append(
+            Case("chain of ten, 60 steps", chain, 60, _falling, _judge_chain, few)
+        )
     rooms = [("piling up", piling, 0.3)]
     if not is_quick:
         rooms.append(("flying", flying, 1.0))
@@ -124,6 +132,73 @@ def _hanging(num_worlds: int) -> np.ndarray:
     state[:, 0, 0], state[:, 0, 1] = SIZE[0] * np.cos(angle), SIZE[0] * np.sin(angle)
     state[:, 0, 2] = angle
     return state
+
+
+def _links() -> chains.Chain:
+    return chains.bars(
+        NUM_LINKS, half_length=LINK[0], half_width=LINK[1], density=DENSITY
+    )
+
+
+def _chain() -> SceneSpec:
+    """Links pinned one to the next, the first to the world."""
+    names = [f"link {i}" for i in range(NUM_LINKS)]
+    near, far = [-LINK[0], 0.0], [LINK[0], 0.0]
+    pin = {"type": "revolute"}
+    pins = [
+        {**pin, "a": names[0], "b": "world", "anchor_a": near, "anchor_b": [0.0, 0.0]}
+    ] + [
+        {**pin, "a": before, "b": name, "anchor_a": far, "anchor_b": near}
+        for before, name in itertools.pairwise(names)
+    ]
+    links = [
+        {
+            "name": name,
+            "pose": [(2 * i + 1) * LINK[0], 0.0, 0.0],
+            "shape": {"type": "box", "half_extents": list(LINK)},
+            "density": DENSITY,
+        }
+        for i, name in enumerate(names)
+    ]
+    return scene_spec_from_dict(
+        {
+            "schema": "planar-scene-1",
+            "gravity": [0.0, -9.81],
+            "dt": DT,
+            "bodies": links,
+            "constraints": pins,
+        }
+    )
+
+
+def _falling(num_worlds: int) -> np.ndarray:
+    """Straight and at rest, an eighth of a turn below level, or a little more."""
+    angle = -np.pi / 4 - np.linspace(0.0, 0.1, num_worlds)
+    reach = (2 * np.arange(NUM_LINKS) + 1) * LINK[0]
+    state = np.zeros((num_worlds, NUM_LINKS, 6))
+    state[..., 0], state[..., 1] = (
+        np.outer(np.cos(angle), reach),
+        np.outer(np.sin(angle), reach),
+    )
+    state[..., 2] = angle[:, None]
+    return state
+
+
+def _judge_chain(states: np.ndarray) -> list[Figure]:
+    """The first world against the chain in its joint angles."""
+    rest = np.zeros(NUM_LINKS)
+    times = DT * np.arange(states.shape[1] + 1)
+    angles, _ = chains.integrate(_links(), rest - np.pi / 4, rest, times)
+    wrong = np.angle(np.exp(1j * (states[0, :, :, 2] - angles[1:])))
+    return [
+        Figure("worst heading in a second", float(np.abs(wrong).max()), "rad", 1.0),
+        Figure(
+            "first pin's drift",
+            1e3 * _drift(states[..., :1, :], (-LINK[0], 0)),
+            "mm",
+            300,
+        ),
+    ]
 
 
 def _judge_spin(viscous: float | None) -> Callable[[np.ndarray], list[Figure]]:
