@@ -108,15 +108,16 @@ def coupled_substep(
         has_changed = functools.reduce(jnp.logical_or, changes)
         return solve_again(_pushed(problem, sums), before.solution, has_changed)
 
+    before = tuple(motion[3:])
     for _ in range(num_sweeps):
         both, impulses = part_all(
-            contacts, eases, rate, moved, (*twists, *sums), impulses
+            contacts, eases, rate, (moved, before), (*twists, *sums), impulses
         )
         solved, sums = answered(solved, sums, both[3:]), both[3:]
         twists = solved.solution.twist
     place = moved_with(motion, _touches(sums), twists, prepared.length)
     both, impulses = settle_all(
-        contacts, eases, tuple(motion[3:]), (*twists, *sums), impulses
+        contacts, eases, rate, before, (*twists, *sums), impulses
     )
     solved, sums = answered(solved, sums, both[3:]), both[3:]
     final = Motion(*place, *solved.solution.twist)

@@ -52,7 +52,7 @@ def part(
     rows: Rows,
     eases: tuple[Ease, Ease],
     rate: FloatScalar,
-    moved: tuple[Twist, Twist],
+    given: tuple[tuple[Twist, Twist], tuple[Twist, Twist]],
     twists: tuple[tuple, tuple],
     impulses: list[Impulse],
 ) -> tuple[tuple[tuple, tuple], list[Impulse]]:
@@ -62,15 +62,18 @@ def part(
         rows: the contact.
         eases: of both bodies.
         rate: one over the length of the substep [1/s].
-        moved: displacement of both bodies since the contact was found [m, m, rad].
+        given: of both, displacement since the contact was found [m, m, rad], and twists
+            when the substep began.
         twists: of both; numbers after the third are sums of impulses.
         impulses: so far.
 
     Returns:
         Twists and impulses.
     """
+    (moved_a, before_a), (moved_b, before_b) = given
+    moved, before = (moved_a, moved_b), (before_a, before_b)
 
-    def demand(row: Row, normal) -> _Demand:
+    def demand(row: Row, normal, speed) -> _Demand:
         shift = jnp.zeros_like(normal)
         for side, sign in ((0, -1.0), (1, 1.0)):
             x, y, angle = moved[side]
@@ -81,7 +84,10 @@ def part(
         is_apart = slack > 0.0
         bias = jnp.where(is_apart, slack, jnp.maximum(_SHARE * slack, -PUSH_SPEED))
         kept = jnp.where(is_apart, 1.0, 1.0 - _SOFTNESS)
-        return _Demand(-bias, kept, jnp.ones_like(kept))
+        own = _approach(rows, row, before)
+        waits, parts = _put_off(rows, row, own, speed, slack, rate)
+        counts = (1.0 - waits) * (1.0 - parts)
+        return _Demand(-bias, jnp.where(counts > 0.0, kept, 1.0 - parts), counts)
 
     return _swept(rows, eases, twists, impulses, demand, is_rubbing_last=False)
 
@@ -89,6 +95,7 @@ def part(
 def settle(
     rows: Rows,
     eases: tuple[Ease, Ease],
+    rate: FloatScalar,
     before: tuple[Twist, Twist],
     twists: tuple[tuple, tuple],
     impulses: list[Impulse],
@@ -101,6 +108,7 @@ def settle(
     Args:
         rows: the contact.
         eases: of both bodies.
+        rate: one over the length of the substep [1/s].
         before: twists of both when the substep began.
         twists: of both; numbers after the third are sums of impulses.
         impulses: so far.
@@ -108,17 +116,44 @@ def settle(
     Returns:
         Twists and impulses.
     """
-    (ax, ay, a_spin), (bx, by, b_spin) = before
-    along = rows.normal[0] * (bx - ax) + rows.normal[1] * (by - ay)
 
-    def demand(row: Row, normal) -> _Demand:
-        speed = along + row.normal_arms[1] * b_spin - row.normal_arms[0] * a_spin
-        bounce = jnp.where(speed < -_REST_SPEED, -rows.restitution * speed, 0.0)
+    def demand(row: Row, normal, speed) -> _Demand:
+        met = _approach(rows, row, before)
+        bounce = jnp.where(met < -_REST_SPEED, -rows.restitution * met, 0.0)
+        waits, _ = _put_off(rows, row, met, speed, jnp.zeros_like(normal), rate)
         touches = (normal > 0.0).astype(normal.dtype)
-        return _Demand(bounce, jnp.ones_like(normal), touches)
+        return _Demand(bounce, jnp.ones_like(normal), touches * (1.0 - waits))
 
     # An impact is found here as a rule: friction has to know of it.
     return _swept(rows, eases, twists, impulses, demand, is_rubbing_last=True)
+
+
+def _approach(rows: Rows, row: Row, twists: tuple[Twist, Twist]) -> FloatScalar:
+    """Speed at which the surfaces part at a point; negative when they approach."""
+    (ax, ay, a_spin), (bx, by, b_spin) = twists
+    along = rows.normal[0] * (bx - ax) + rows.normal[1] * (by - ay)
+    return along + row.normal_arms[1] * b_spin - row.normal_arms[0] * a_spin
+
+
+def _put_off(
+    rows: Rows, row: Row, before: FloatScalar, now: FloatScalar, slack, rate
+) -> tuple:
+    """Whether a point is left to the next substep, and whether it lets go, as numbers.
+
+    Bodies that bounce and that meet only through what others do to them within this
+    substep have an impact of their own, after the one that caused it: of a row of balls
+    the last flies off. Those that part as they bounced before let go, whatever others
+    do to them. Neither is so where one would sink into the other by more than a quarter
+    of its thickness.
+    """
+    a, b = (jnp.abs(arm) for arm in row.tangent_arms)
+    is_mild = -(now + slack) < 0.5 * rate * jnp.minimum(a, b)
+    bounces = (rows.restitution > 0.0) & is_mild
+    parts = before > _REST_SPEED
+    is_hit = now < -(_REST_SPEED + jnp.maximum(slack, 0.0))
+    waits = bounces & is_hit & (jnp.abs(before) <= _REST_SPEED)
+    dtype = slack.dtype
+    return waits.astype(dtype), (bounces & parts).astype(dtype)
 
 
 class _Demand(NamedTuple):
@@ -129,7 +164,7 @@ class _Demand(NamedTuple):
     kept: FloatScalar
     """Part of the impulse that is not given up."""
     counts: FloatScalar
-    """One, or zero where nothing is asked."""
+    """One, or zero where nothing is asked and the impulse stays as it is."""
 
 
 def _swept(
@@ -171,7 +206,10 @@ def _swept(
             change(i, jnp.minimum(jnp.maximum(new, -limit), limit))
 
     def press() -> None:
-        demands = [demand(row, totals[2 + i]) for i, row in enumerate(rows.points)]
+        demands = [
+            demand(row, totals[2 + i], speeds[2 + i])
+            for i, row in enumerate(rows.points)
+        ]
         new = _normals(
             [g * d.counts for g, d in zip(gains[2:], demands, strict=True)],
             _coupling(a, b, direction, arms, 2, 3),
@@ -223,7 +261,7 @@ def _normals(gains: list, coupling, lacking: list, before: list, kept: list) -> 
         jnp.where(is_shared, shared[0], jnp.where(is_first, single[0], 0.0)),
         jnp.where(is_shared, shared[1], jnp.where(is_first, 0.0, single[1])),
     ]
-    return [jnp.where(counts[i], kept[i] * new[i], before[i]) for i in range(2)]
+    return [kept[i] * jnp.where(counts[i], new[i], before[i]) for i in range(2)]
 
 
 def _coupling(a: Ease, b: Ease, direction, arms, j: int, i: int) -> FloatScalar:

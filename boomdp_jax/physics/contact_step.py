@@ -121,7 +121,7 @@ def part_all(
     contacts: Contacts,
     eases: list[Halves],
     rate: Float[Array, " lane"],
-    moved: tuple,
+    given: tuple[tuple, tuple],
     twists: tuple,
     impulses: Impulses,
 ) -> tuple[tuple, Impulses]:
@@ -131,25 +131,21 @@ def part_all(
         contacts: of this step.
         eases: of both bodies of each pair, round by round.
         rate: one over the length of the substep [1/s].
-        moved: displacement of every body in this step.
+        given: displacement of every body in this step, and its twist when the substep
+            began.
         twists: of every body; numbers after the third are sums of impulses.
         impulses: so far.
 
     Returns:
         Twists and impulses.
     """
-    num_pairs = num_seats(twists[0].shape[0]) // 2
-    rates = jnp.broadcast_to(rate[None], (num_pairs, *rate.shape))
-
-    def one(rows, ease, *rest):
-        return over_pairs(part, rows, ease, rates, *rest)
-
-    return _sweep(one, contacts, eases, moved, twists, impulses)
+    return _sweep(part, contacts, eases, rate, given, twists, impulses)
 
 
 def settle_all(
     contacts: Contacts,
     eases: list[Halves],
+    rate: Float[Array, " lane"],
     before: tuple,
     twists: tuple,
     impulses: Impulses,
@@ -159,6 +155,7 @@ def settle_all(
     Args:
         contacts: of this step.
         eases: of both bodies of each pair, round by round.
+        rate: one over the length of the substep [1/s].
         before: twists of every body when the substep began.
         twists: of every body; numbers after the third are sums of impulses.
         impulses: so far.
@@ -166,19 +163,17 @@ def settle_all(
     Returns:
         Twists and impulses.
     """
-
-    def one(*pair):
-        return over_pairs(settle, *pair)
-
-    return _sweep(one, contacts, eases, before, twists, impulses)
+    return _sweep(settle, contacts, eases, rate, before, twists, impulses)
 
 
-def _sweep(function, contacts, eases, given, twists, impulses):
+def _sweep(function, contacts, eases, rate, given, twists, impulses):
     """Round after round, with what of each body is given and what is changed."""
     num_bodies, after = twists[0].shape[0], []
+    num_pairs = num_seats(num_bodies) // 2
+    rates = jnp.broadcast_to(rate[None], (num_pairs, *rate.shape))
     twists, given = seated(twists, num_bodies), seated(given, num_bodies)
     for rows, ease, before in zip(contacts.rows, eases, impulses, strict=True):
-        twists, impulse = function(rows, ease, given, twists, before)
+        twists, impulse = over_pairs(function, rows, ease, rates, given, twists, before)
         after.append(impulse)
         twists, given = moved_on(twists), moved_on(given)
     return unseated(twists, num_bodies), after
@@ -213,16 +208,17 @@ def contact_substep(
     """
     given = ease(touch.sums)
     start = tuple(v + dv for v, dv in zip(free, given, strict=True))
+    before, rate = tuple(motion[3:]), 1.0 / length
     twists, impulses = start, touch.impulses
     for _ in range(num_sweeps):
         twists, impulses = part_all(
-            contacts, eases, 1.0 / length, moved, twists, impulses
+            contacts, eases, rate, (moved, before), twists, impulses
         )
     touches = functools.reduce(
         jnp.logical_or, [c != 0.0 for c in _changes(twists, free, given)]
     )
     place = moved_with(motion, touches, twists, length)
-    final, impulses = settle_all(contacts, eases, tuple(motion[3:]), twists, impulses)
+    final, impulses = settle_all(contacts, eases, rate, before, twists, impulses)
     # What the impulses on a body sum up to follows from what they did to it.
     sums = tuple(
         jnp.where(e > 0.0, change / jnp.where(e > 0.0, e, 1.0), 0.0)
