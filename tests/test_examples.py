@@ -88,3 +88,49 @@ def test_second_example_says_which_recording_is_missing(tmp_path):
     result = run_example("02_real_pendulum.py", tmp_path)
     assert result.returncode == 2
     assert "swing_up_1.csv: no such recording" in result.stderr
+
+
+def write_pushes(folder, num_pushes, friction):
+    """A made-up record: pushes through the centre, against the left face.
+
+    The block follows its finger, whose force is the friction of the board.
+    """
+    weight, steps, touch, length = 1.518 * 9.81, 168, 1e-3, 15e-3
+    way = np.linspace(0.0, length, steps)
+    poses, rows = [], []
+    for push in range(num_pushes):
+        heading = 0.7 * push
+        ahead = np.array([np.cos(heading), np.sin(heading)])
+        start = np.array([0.5, 0.1 * push])
+        end = start + (length - touch) * ahead
+        poses.append([push, *start, heading, *end, heading])
+        tips = start + (way[:, None] - 0.05 - touch) * ahead
+        force = np.where(way[:, None] > touch, friction * weight * ahead, 0.0)
+        clock = 0.04 * np.arange(steps)
+        rows.append(np.column_stack([np.full(steps, push), clock, tips, force]))
+    names = "push,x0,y0,theta0,x1,y1,theta1", "push,time,tip_x,tip_y,fx,fy"
+    for what, table, header in zip(
+        ("poses", "force"), (poses, np.concatenate(rows)), names, strict=True
+    ):
+        path = folder / f"hard_3pts2_{what}.csv"
+        np.savetxt(path, table, delimiter=",", header=header, comments="")
+
+
+@pytest.mark.slow
+def test_third_example_finds_the_friction_of_made_up_pushes(tmp_path):
+    write_pushes(tmp_path, 6, 0.3)
+    out = tmp_path / "out"
+    result = run_example("03_real_pushes.py", tmp_path, "--quick", "--out", out)
+    assert result.returncode == 0, result.stderr[-2000:]
+    found = float(result.stdout.split("friction of the board")[1].split()[0])
+    assert found == pytest.approx(0.3 * 1.518 * 9.81, rel=0.06)
+    place = float(result.stdout.split("place ")[1].split()[0])
+    assert place < 0.5
+    assert_is_picture(out / "real_pushes.png")
+
+
+@pytest.mark.slow
+def test_third_example_says_where_the_recording_comes_from(tmp_path):
+    result = run_example("03_real_pushes.py", tmp_path)
+    assert result.returncode == 2
+    assert "robinzhoucmu/Pushing" in result.stderr

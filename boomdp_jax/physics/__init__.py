@@ -39,6 +39,7 @@ from boomdp_jax.physics.step import StepInfo as StepInfo
 from boomdp_jax.physics.step import prepare_step as prepare_step
 from boomdp_jax.physics.step import rollout as rollout
 from boomdp_jax.physics.step import step as step
+from boomdp_jax.physics.world_rollout import empty_cache as empty_cache
 
 __all__ = [
     "WORLD",
@@ -59,6 +60,7 @@ __all__ = [
     "angular_momentum",
     "constraint_error",
     "contact_flags",
+    "empty_cache",
     "empty_params",
     "fell_over",
     "first_contact",
