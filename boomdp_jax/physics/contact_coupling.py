@@ -25,7 +25,6 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
 
 from boomdp_jax.core.one_loop import elementwise
 from boomdp_jax.physics.body_friction import (
@@ -41,6 +40,7 @@ from boomdp_jax.physics.contact_step import (
     moved_with,
     part_all,
     settle_all,
+    touching,
 )
 from boomdp_jax.physics.contact_world import each_round
 from boomdp_jax.physics.general_step import projected, velocity_problem
@@ -115,7 +115,8 @@ def coupled_substep(
         )
         solved, sums = answered(solved, sums, both[3:]), both[3:]
         twists = solved.solution.twist
-    place = moved_with(motion, _touches(sums), twists, prepared.length)
+    touches = touching(contacts, [problem.mobile / problem.mass * p for p in sums])
+    place = moved_with(motion, touches, twists, prepared.length)
     both, impulses = settle_all(
         contacts, eases, rate, before, (*twists, *sums), impulses
     )
@@ -123,10 +124,6 @@ def coupled_substep(
     final = Motion(*place, *solved.solution.twist)
     final = projected(prepared, problem, is_settled, force, motion, final)
     return final, Touch(impulses, sums)
-
-
-def _touches(sums: tuple) -> Bool[Array, "body lane"]:
-    return (sums[0] != 0.0) | (sums[1] != 0.0) | (sums[2] != 0.0)
 
 
 def _pushed(problem: VelocityProblem, sums: tuple) -> VelocityProblem:

@@ -4,15 +4,21 @@ Projected Gauss-Seidel: $\lambda \leftarrow \Pi(\lambda - (\dot C + b)/K)$ with 
 projection on what is allowed, rows of a pair one after another, pairs without a common
 body at once. The two normal rows of a pair are solved together and exactly.
 
-Compared on a tower of five boxes at 60 Hz, ten seconds, four substeps of one sweep
-each (deepest overlap while the impulses build up, where it ends, and how far the tower
-strayed): as it is 0.75, 0.55 and 1.9 mm; normal rows one after another 0.92, 0.55 and
-2.5 mm; without softness, as Baumgarte (1972) has it, 0.72, 0.00 and 1.6 mm, but with a
-box of a hundred times the mass on top it collapses, while the soft one stands 14 mm
-deep; two substeps 3.5, 2.2 and 7.9 mm; two substeps of two sweeps 2.3, 2.2 and 6.9 mm,
-so that a substep is worth more than a sweep (Macklin et al. 2019, Small steps in
-physics simulation). Second sweeps in opposite order, and leaving the impulses of an
-impact out of the next start, made heaps worse.
+Compared on a tower of five boxes at 60 Hz, ten seconds (deepest overlap, that in the
+last second, and how far a box strayed, in mm; `benchmarks/contact_settings.py`): four
+substeps of one sweep, as it is, 0.55, 0.55 and 0.57; the same without the impulses of
+the step before 3.9, 3.9 and 11; without softness, as Baumgarte (1972) has it, 0.38,
+0.00 and 1.4, but with a box of a hundred times the mass on top it collapses, while the
+soft one stands 14 mm deep; two substeps 2.2, 2.2 and 5.5; two substeps of two sweeps
+2.2, 2.2 and 5.4, and one of four 8.8, 8.8 and 25, so that a substep is worth more than
+a sweep (Macklin et al. 2019, Small steps in physics simulation). Tried and not kept:
+normal rows one after another (a fifth deeper), second sweeps in opposite order, and
+leaving the impulses of an impact out of the next start (heaps got worse).
+
+Where contact is smoothed (`Scene.smoothing`, s) impulse and residual speed are on the
+central path $\lambda w = s^2/K$ in place of $\lambda w = 0$, and the bounds of friction
+are rounded off likewise (Pang et al. 2023, Global planning for contact-rich
+manipulation via local smoothing of quasi-dynamic contact models).
 """
 
 from typing import NamedTuple
@@ -48,10 +54,23 @@ _SOFTNESS = float(1.0 / (1.0 + _TURN * (2.0 * _DAMPING + _TURN)))
 """Part of an overlapping point's impulse that is given up in an iteration."""
 
 
+# Rounds in which the two smoothed normal impulses of a pair find each other.
+_NUM_SMOOTHED = 4
+
+
+class Pace(NamedTuple):
+    """What is the same for all contacts of a world."""
+
+    rate: FloatScalar
+    """One over the length of the substep [1/s]."""
+    smoothing: FloatScalar | None = None
+    """Speed by which contact is smoothed [m/s]; None: not at all."""
+
+
 def part(
     rows: Rows,
     eases: tuple[Ease, Ease],
-    rate: FloatScalar,
+    pace: Pace,
     given: tuple[tuple[Twist, Twist], tuple[Twist, Twist]],
     twists: tuple[tuple, tuple],
     impulses: list[Impulse],
@@ -61,7 +80,7 @@ def part(
     Args:
         rows: the contact.
         eases: of both bodies.
-        rate: one over the length of the substep [1/s].
+        pace: length of the substep and smoothing.
         given: of both, displacement since the contact was found [m, m, rad], and twists
             when the substep began.
         twists: of both; numbers after the third are sums of impulses.
@@ -80,22 +99,44 @@ def part(
             turned = row.normal_arms[side] * angle
             turned = turned - row.tangent_arms[side] * (0.5 * angle * angle)
             shift = shift + sign * (rows.normal[0] * x + rows.normal[1] * y + turned)
-        slack = rate * (row.separation + shift)
-        is_apart = slack > 0.0
-        bias = jnp.where(is_apart, slack, jnp.maximum(_SHARE * slack, -PUSH_SPEED))
-        kept = jnp.where(is_apart, 1.0, 1.0 - _SOFTNESS)
+        slack = pace.rate * (row.separation + shift)
+        bias, kept = _softened(slack, pace.smoothing)
         own = _approach(rows, row, before)
-        waits, parts = _put_off(rows, row, own, speed, slack, rate)
+        waits, parts = _put_off(rows, row, own, speed, slack, pace.rate)
         counts = (1.0 - waits) * (1.0 - parts)
         return _Demand(-bias, jnp.where(counts > 0.0, kept, 1.0 - parts), counts)
 
-    return _swept(rows, eases, twists, impulses, demand, is_rubbing_last=False)
+    return _swept(rows, eases, pace, twists, impulses, demand, is_rubbing_last=False)
+
+
+def _softened(slack: FloatScalar, smoothing: FloatScalar | None) -> tuple:
+    """Speed at which a point may approach, and the part of its impulse that is kept."""
+    if smoothing is None:
+        is_apart = slack > 0.0
+        bias = jnp.where(is_apart, slack, jnp.maximum(_SHARE * slack, -PUSH_SPEED))
+        return bias, jnp.where(is_apart, 1.0, 1.0 - _SOFTNESS)
+    bias = jnp.maximum(_SHARE * slack, -PUSH_SPEED)
+    bias = bias + (1.0 - _SHARE) * _smooth_plus(slack, smoothing)
+    touches = 0.5 - 0.5 * slack / jnp.sqrt(slack**2 + smoothing**2)
+    return bias, 1.0 - _SOFTNESS * touches
+
+
+def _smooth_plus(value: FloatScalar, size: FloatScalar) -> FloatScalar:
+    """The larger of a value and zero, rounded off: x (x - value) = size squared."""
+    square = value * value + 4.0 * size * size
+    is_some = square > 0.0
+    root = jnp.where(is_some, jnp.sqrt(jnp.where(is_some, square, 1.0)), 0.0)
+    # The form that does not cancel.
+    other = jnp.where(
+        is_some, 2.0 * size * size / jnp.where(root > 0, root - value, 1), 0.0
+    )
+    return jnp.where(value > 0.0, 0.5 * (value + root), other)
 
 
 def settle(
     rows: Rows,
     eases: tuple[Ease, Ease],
-    rate: FloatScalar,
+    pace: Pace,
     before: tuple[Twist, Twist],
     twists: tuple[tuple, tuple],
     impulses: list[Impulse],
@@ -108,7 +149,7 @@ def settle(
     Args:
         rows: the contact.
         eases: of both bodies.
-        rate: one over the length of the substep [1/s].
+        pace: length of the substep and smoothing.
         before: twists of both when the substep began.
         twists: of both; numbers after the third are sums of impulses.
         impulses: so far.
@@ -120,12 +161,17 @@ def settle(
     def demand(row: Row, normal, speed) -> _Demand:
         met = _approach(rows, row, before)
         bounce = jnp.where(met < -_REST_SPEED, -rows.restitution * met, 0.0)
-        waits, _ = _put_off(rows, row, met, speed, jnp.zeros_like(normal), rate)
-        touches = (normal > 0.0).astype(normal.dtype)
+        waits, _ = _put_off(rows, row, met, speed, jnp.zeros_like(normal), pace.rate)
+        if pace.smoothing is None:
+            touches = (normal > 0.0).astype(normal.dtype)
+        else:
+            # An impulse that is only due to smoothing is none to put right.
+            most = (normal / jnp.where(row.gains[0] > 0.0, row.gains[0], 1.0)) ** 2
+            touches = most / (most + pace.smoothing**2)
         return _Demand(bounce, jnp.ones_like(normal), touches * (1.0 - waits))
 
     # An impact is found here as a rule: friction has to know of it.
-    return _swept(rows, eases, twists, impulses, demand, is_rubbing_last=True)
+    return _swept(rows, eases, pace, twists, impulses, demand, is_rubbing_last=True)
 
 
 def _approach(rows: Rows, row: Row, twists: tuple[Twist, Twist]) -> FloatScalar:
@@ -168,9 +214,17 @@ class _Demand(NamedTuple):
 
 
 def _swept(
-    rows: Rows, eases: tuple[Ease, Ease], twists, impulses, demand, *, is_rubbing_last
+    rows: Rows,
+    eases: tuple[Ease, Ease],
+    pace: Pace,
+    twists,
+    impulses,
+    demand,
+    *,
+    is_rubbing_last,
 ):
     """One pass over the four rows, both normals at once."""
+    smoothing = pace.smoothing
     nx, ny = rows.normal
     a, b = eases
     (ax, ay, a_spin), (bx, by, b_spin) = twists[0][:3], twists[1][:3]
@@ -203,7 +257,12 @@ def _swept(
         for i in range(2):
             limit = rows.friction * totals[2 + i]
             new = totals[i] - gains[i] * speeds[i]
-            change(i, jnp.minimum(jnp.maximum(new, -limit), limit))
+            if smoothing is None:
+                change(i, jnp.minimum(jnp.maximum(new, -limit), limit))
+                continue
+            size = gains[i] * smoothing
+            above, below = (_smooth_plus(new + s * limit, size) for s in (1.0, -1.0))
+            change(i, above - below - limit)
 
     def press() -> None:
         demands = [
@@ -216,6 +275,7 @@ def _swept(
             [v - d.speed for v, d in zip(speeds[2:], demands, strict=True)],
             totals[2:],
             [d.kept for d in demands],
+            smoothing,
         )
         change(2, new[0])
         change(3, new[1])
@@ -236,7 +296,9 @@ def _swept(
     return (out[0], out[1]), impulses
 
 
-def _normals(gains: list, coupling, lacking: list, before: list, kept: list) -> list:
+def _normals(
+    gains: list, coupling, lacking: list, before: list, kept: list, smoothing
+) -> list:
     """Both normal impulses, which meet their two demands exactly.
 
     The linear complementarity problem of two unknowns has four cases; one after another
@@ -261,6 +323,12 @@ def _normals(gains: list, coupling, lacking: list, before: list, kept: list) -> 
         jnp.where(is_shared, shared[0], jnp.where(is_first, single[0], 0.0)),
         jnp.where(is_shared, shared[1], jnp.where(is_first, 0.0, single[1])),
     ]
+    if smoothing is not None:
+        sizes = [gain * smoothing for gain in gains]
+        new = [_smooth_plus(alone[i], sizes[i]) for i in range(2)]
+        for _ in range(_NUM_SMOOTHED):
+            for i in range(2):
+                new[i] = _smooth_plus(alone[i] - ratio[i] * new[1 - i], sizes[i])
     return [kept[i] * jnp.where(counts[i], new[i], before[i]) for i in range(2)]
 
 

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.one_loop import one_loop
-from boomdp_jax.physics.contact_impulses import part, settle
+from boomdp_jax.physics.contact_impulses import Pace, part, settle
 from boomdp_jax.physics.contact_rows import Ease, Rows, Side, add_pushes, begin
 from boomdp_jax.physics.contact_world import ContactWorld, Fixed
 from boomdp_jax.physics.motion import Motion
@@ -43,6 +43,7 @@ class Contacts(NamedTuple):
     """Round by round, `[pair, lane]`."""
     overlap: Float[Array, " lane"]
     """Deepest, when they were found [m]."""
+    smoothing: Float[Array, " lane"] | None
 
 
 class Touch(NamedTuple):
@@ -103,7 +104,8 @@ def find_contacts(
         sums = over_pairs(add_pushes, start.rows, start.impulses, sums)
         halves, sums = moved_on(halves), moved_on(sums)
     overlap = jnp.maximum(-functools.reduce(jnp.minimum, nearest), 0.0)
-    return Contacts(rows, overlap), Touch(kept, unseated(sums, num_bodies))
+    contacts = Contacts(rows, overlap, world.smoothing)
+    return contacts, Touch(kept, unseated(sums, num_bodies))
 
 
 def _begin(
@@ -170,10 +172,13 @@ def _sweep(function, contacts, eases, rate, given, twists, impulses):
     """Round after round, with what of each body is given and what is changed."""
     num_bodies, after = twists[0].shape[0], []
     num_pairs = num_seats(num_bodies) // 2
-    rates = jnp.broadcast_to(rate[None], (num_pairs, *rate.shape))
+    pace = jax.tree.map(
+        lambda one: jnp.broadcast_to(one[None], (num_pairs, *one.shape)),
+        Pace(rate, contacts.smoothing),
+    )
     twists, given = seated(twists, num_bodies), seated(given, num_bodies)
     for rows, ease, before in zip(contacts.rows, eases, impulses, strict=True):
-        twists, impulse = over_pairs(function, rows, ease, rates, given, twists, before)
+        twists, impulse = over_pairs(function, rows, ease, pace, given, twists, before)
         after.append(impulse)
         twists, given = moved_on(twists), moved_on(given)
     return unseated(twists, num_bodies), after
@@ -214,10 +219,8 @@ def contact_substep(
         twists, impulses = part_all(
             contacts, eases, rate, (moved, before), twists, impulses
         )
-    touches = functools.reduce(
-        jnp.logical_or, [c != 0.0 for c in _changes(twists, free, given)]
-    )
-    place = moved_with(motion, touches, twists, length)
+    changes = _changes(twists, free, given)
+    place = moved_with(motion, touching(contacts, changes), twists, length)
     final, impulses = settle_all(contacts, eases, rate, before, twists, impulses)
     # What the impulses on a body sum up to follows from what they did to it.
     sums = tuple(
@@ -241,12 +244,29 @@ def _changes(twists: tuple, free: tuple, given: tuple) -> list:
     return changes
 
 
+def touching(contacts: Contacts, changes: list) -> Float[Array, "body lane"]:
+    """Which bodies contacts do anything to, as one or zero.
+
+    Args:
+        contacts: of this step.
+        changes: of twists by contacts, or of momenta.
+
+    Returns:
+        In between where contact is smoothed and bodies are hardly pushed.
+    """
+    if contacts.smoothing is None:
+        touches = functools.reduce(jnp.logical_or, [c != 0.0 for c in changes])
+        return touches.astype(changes[0].dtype)
+    square = changes[0] ** 2 + changes[1] ** 2
+    return square / (square + contacts.smoothing[None] ** 2)
+
+
 def moved_with(motion: Motion, touches, twists: tuple, length) -> list:
     """Poses at the end of a substep.
 
     Args:
         motion: at the start.
-        touches: which bodies any impulse came to.
+        touches: share of the new twists beside the mean of old and new.
         twists: before positions are moved.
         length: of the substep [s].
 
@@ -254,6 +274,6 @@ def moved_with(motion: Motion, touches, twists: tuple, length) -> list:
         x, y and theta.
     """
     return [
-        place + length[None] * jnp.where(touches, new, 0.5 * (old + new))
+        place + 0.5 * length[None] * ((1.0 + touches) * new + (1.0 - touches) * old)
         for place, old, new in zip(motion[:3], motion[3:], twists, strict=True)
     ]

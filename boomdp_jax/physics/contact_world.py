@@ -50,6 +50,8 @@ class ContactWorld(NamedTuple):
     eases: list[Halves]
     """`contact_rows.Ease` of both bodies of each pair, round by round, as if nothing
     held them."""
+    smoothing: Float[Array, " lane"] | None
+    """`Scene.smoothing`."""
 
 
 def contact_world(scene: Scene, params: Params, prepared: Prepared) -> ContactWorld:
@@ -94,6 +96,7 @@ def contact_world(scene: Scene, params: Params, prepared: Prepared) -> ContactWo
         fixed,
         _of_pairs(_may_touch(scene, params, prepared)),
         each_round(ease, num_bodies),
+        scene.smoothing,
     )
 
 

@@ -34,6 +34,11 @@ class Scene(eqx.Module):
     collides: Bool[Array, "*batch body body"] | None = None
     """Which bodies may touch each other, symmetric; None: there is no contact. Bodies
     that a joint connects do not touch, whatever this says."""
+    smoothing: Float[Array, "*batch"] | None = None
+    """Speed s by which contact is smoothed [m/s]; None: not at all. Bodies then push
+    each other before they touch, at a gap d with an acceleration of s²/d, and friction
+    gives way a little before its limit, so that there are derivatives of what does not
+    touch yet (`step`)."""
     num_substeps: int = eqx.field(static=True, default=2)
     """Equal parts into which a step is cut."""
     num_sweeps: int = eqx.field(static=True, default=1)

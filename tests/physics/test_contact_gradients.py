@@ -1,5 +1,7 @@
 """Derivatives through contact: closed forms, finite differences, both modes."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -110,3 +112,58 @@ def test_derivatives_are_finite_where_centres_coincide():
     forward, backward = _jacobians(spec)
     assert np.all(np.isfinite(forward))
     assert np.all(np.isfinite(backward))
+
+
+def _pushed_end(scene, params, state, force):
+    """Where a box ends that a disc is pushed against, along the push."""
+    wrenches = jnp.zeros((60, 2, 3)).at[:, 0, 0].set(force)
+    states, _ = rollout(scene, params, state, wrenches)
+    return states.pose[-1, 1, 0]
+
+
+_end = jax.jit(_pushed_end)
+_slopes = [jax.jit(mode(_pushed_end, argnums=3)) for mode in (jax.jacfwd, jax.jacrev)]
+
+
+def _smoothed(spec, speed):
+    scene = dataclasses.replace(spec.scene, smoothing=jnp.asarray(speed))
+    return scene, spec.params(), spec.initial_state()
+
+
+def test_smoothing_tells_of_what_does_not_touch_yet():
+    disc = body("disc", 0.1, (-0.5, 0.0, 0.0))
+    spec = spec_of(disc, body("box", (0.1, 0.1), (0.0, 0.02, 0.0)), gravity=(0.0, 0.0))
+    sharp = spec.scene, spec.params(), spec.initial_state()
+    # 0.2 N do not bring the disc to the box in a second, 2 N do.
+    assert float(_slopes[0](*sharp, 0.2)) == 0.0
+    for force in (0.2, 0.42, 2.0):
+        difference = _end(*_smoothed(spec, 0.05), force + 1e-5)
+        difference = (difference - _end(*_smoothed(spec, 0.05), force - 1e-5)) / 2e-5
+        assert float(difference) > 1e-4
+        for slope in _slopes:
+            found = float(slope(*_smoothed(spec, 0.05), force))
+            assert found == pytest.approx(float(difference), rel=1e-5)
+    errors = [
+        abs(float(_end(*_smoothed(spec, speed), 2.0) - _end(*sharp, 2.0)))
+        for speed in (0.05, 0.01, 0.002)
+    ]
+    assert errors[0] > 2.0 * errors[1] > 4.0 * errors[2]
+    assert errors[2] < 1e-3
+
+
+def test_smoothing_pushes_with_its_square_over_the_gap():
+    gap, speed = 0.05, 0.01
+    ends = [body(f"disc {i}", 0.1, (i * (0.2 + gap), 0.0, 0.0)) for i in range(2)]
+    spec = spec_of(*ends, gravity=(0.0, 0.0))
+    scene, params, state = _smoothed(spec, speed)
+    states, _ = jax.jit(rollout)(scene, params, state, jnp.zeros((3, 2, 3)))
+    apart = float(states.twist[-1, 1, 0] - states.twist[-1, 0, 0])
+    assert apart == pytest.approx(speed**2 / gap * 3 / 60, rel=0.02)
+
+
+def test_a_smoothed_tower_stands():
+    boxes = [body(f"box{i}", (0.2, 0.1), (0.0, 0.1 + 0.2 * i, 0.0)) for i in range(5)]
+    scene, params, state = _smoothed(spec_of(FLOOR, *boxes), 0.05)
+    states, info = jax.jit(rollout)(scene, params, state, jnp.zeros((300, 6, 3)))
+    assert np.max(np.abs(states.pose[-1] - state.pose)) < 5e-3
+    assert np.max(info.overlap) < 1e-3
