@@ -30,7 +30,7 @@ from boomdp_jax.physics.velocity_solve import Laws, Limits, VelocityProblem
 # Most that a row may change from mid-step to the end of a substep, squared and relative
 # in the metric of the masses: as much as a lever that turns by a quarter of a radian.
 _MOST_CHANGE = 0.06
-# Turn [rad] of a body in a substep from which its joints are not right at its end.
+# Turn [rad] of a body in a substep from which its joints and wheels are not right.
 _MOST_TURN = 0.4
 # So many times its kinetic energy no substep adds to it out of nothing. Less than that
 # a sweep over contacts may, while the impulses of an impact find their place.
@@ -233,9 +233,9 @@ def projected(
         The end.
     """
     end, is_far = project(prepared, end)
-    is_right = is_settled & ~is_far
+    is_right = is_settled & ~is_far & ~_is_fast(prepared, problem, end)
     if problem.is_steady is not None:
-        is_right = is_right & problem.is_steady & ~_is_fast(prepared, problem, end)
+        is_right = is_right & problem.is_steady
     half_mass = 0.5 * prepared.mobile * prepared.mass
     half_inertia = 0.5 * prepared.mobile * prepared.inertia
 
@@ -269,13 +269,19 @@ def projected(
 def _is_fast(
     prepared: Prepared, problem: VelocityProblem, end: Motion
 ) -> Bool[Array, " lane"]:
-    """Whether a body with a joint ends up turning too far in a substep."""
+    """Whether a body with a joint or friction ends up turning too far in a substep."""
+    turned = prepared.length[None] * jnp.abs(jax.lax.stop_gradient(end.spin))
+    is_fast = jnp.zeros(turned.shape[-1:], bool)
+    if problem.contacts is not None:
+        rubs = jnp.any(problem.contacts.viscous[0] > 0.0, axis=0)
+        rubs = rubs | jnp.any(problem.contacts.viscous[1] > 0.0, axis=0)
+        is_fast = is_fast | jnp.any(rubs & (turned > _MOST_TURN), axis=0)
     rows: Any = problem.rows_mid
-    ease: Any = problem.ease
-    spin = jnp.abs(jax.lax.stop_gradient(end.spin))
-    spin = jnp.maximum(of_body(rows.a, spin), of_body(rows.b, spin))
-    is_far = prepared.length[None] * spin > _MOST_TURN
-    return jnp.any(is_far & (ease > 0.0), axis=0)
+    if rows is not None:
+        ease: Any = problem.ease
+        most = jnp.maximum(of_body(rows.a, turned), of_body(rows.b, turned))
+        is_fast = is_fast | jnp.any((most > _MOST_TURN) & (ease > 0.0), axis=0)
+    return is_fast
 
 
 def _motor_work(prepared: Prepared, problem: VelocityProblem, end: Motion):
