@@ -6,6 +6,10 @@ WHEEL = "#0072B2"
 """Blue."""
 ROD = "#CC79A7"
 """Purple."""
+SLIDE = "#56B4E9"
+"""Sky blue."""
+WELD = "#000000"
+"""Black."""
 FLOOR = "#009E73"
 """Green."""
 BODY = "#E8E4DA"
@@ -26,8 +30,8 @@ BY_KIND = {
     "distance": ROD,
     "wheel": WHEEL,
     "ground": FLOOR,
-    "prismatic": ROD,
-    "weld": PIN,
+    "prismatic": SLIDE,
+    "weld": WELD,
 }
 
 OUTLINE_STYLE = {"facecolor": BODY, "edgecolor": EDGE, "linewidth": 1.2, "zorder": 1}
