@@ -104,8 +104,10 @@ def test_cradle_of_five_hands_the_speed_on(order, num_thrown, heading, gap):
     ]
     _, _, last = run(spec_of(*balls, gravity=(0.0, 0.0)), 60)
     along = (last.twist[:, :2] @ direction)[np.argsort(order)]
-    # Equal balls exchange velocities: as many fly off as came.
-    np.testing.assert_allclose(along, speed[::-1], atol=0.05)
+    # Equal balls exchange velocities: as many fly off as came. Those that came together
+    # overlap a little when they hit, and are parted meanwhile.
+    atol = 1e-6 if num_thrown == 1 else 0.05
+    np.testing.assert_allclose(along, speed[::-1], atol=atol)
     assert np.sum(along**2) == pytest.approx(np.sum(speed**2), rel=2e-3)
 
 
