@@ -16,7 +16,7 @@ function of twists whose curvature is least where everything slips; a sweep that
 a body to answer as it does there never gives more than is missing. With the slope at
 the present twist instead, a body that stands on stiff dry feet (1e5 N s/m, 1.5 kg)
 takes from a finger at 3 mm/s the impulse that would move it as long as it sticks, and
-is thrown 8 mm ahead; the same with twelve sweeps.
+is thrown 8 mm ahead; with twelve sweeps 0.8 mm, again and again.
 
 All arrays of public functions are in lanes (`core.lanes`).
 """

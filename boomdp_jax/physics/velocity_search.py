@@ -137,7 +137,7 @@ def _good_share(problem: VelocityProblem, guess: Solution, found: Solution) -> A
 
     def narrow(turn, ends):
         low, high, at_low, at_high = ends
-        share = jnp.clip(_secant(*ends), 0.05, 0.95)
+        share = jnp.clip(_secant(*ends[2:]), 0.05, 0.95)
         share = low + (high - low) * share
         # Both ends come first.
         share = jnp.where(turn == 0, 0.0, jnp.where(turn == 1, 1.0, share))
@@ -154,13 +154,12 @@ def _good_share(problem: VelocityProblem, guess: Solution, found: Solution) -> A
     ends = (zero, zero + 1.0, zero, zero)
     ends = jax.lax.fori_loop(0, _NUM_NARROWED, narrow, ends)
     low, high, _, at_high = ends
-    share = low + (high - low) * jnp.clip(_secant(*ends), 0.0, 1.0)
+    share = low + (high - low) * jnp.clip(_secant(*ends[2:]), 0.0, 1.0)
     return jnp.where(at_high <= 0.0, 1.0, share)
 
 
-def _secant(low, high, at_low, at_high) -> Array:
+def _secant(at_low, at_high) -> Array:
     """Where between two ends a line through their values is zero; else half-way."""
-    del low, high
     gap = at_high - at_low
     return jnp.where(gap > 0.0, -at_low / jnp.where(gap > 0.0, gap, 1.0), 0.5)
 

@@ -110,8 +110,6 @@ class Solved(NamedTuple):
     """What an iteration finds."""
 
     solution: Solution
-    answer: BodyAnswer
-    """What it took bodies to answer to an impulse, joints apart."""
     is_settled: Bool[Array, " lane"]
     """Whether a last iteration changed next to nothing, as far as is known."""
 
@@ -145,8 +143,8 @@ def newton_step(
     unknown, zero = jnp.ones(problem.mass.shape[-1], bool), jnp.zeros_like(problem.mass)
     given = (zero, zero, zero)
     if guess.impulse is None:
-        answer, free = answer_of_bodies(problem, friction, guess.twist, given)
-        return Solved(Solution(free, guess.twist, None), answer, unknown)
+        _, free = answer_of_bodies(problem, friction, guess.twist, given)
+        return Solved(Solution(free, guess.twist, None), unknown)
     push, end, gain, diagonal, demand, is_needed = _system(problem, guess, is_limited)
     pushes = tuple(tuple(j * guess.impulse for j in row) for row in (push.ja, push.jb))
     given = to_bodies(push, pushes, given)
@@ -164,7 +162,7 @@ def newton_step(
     one = runtime_one(problem.mass)
     x, y, spin = (hold(v, one) for v in twist)
     impulse = guess.impulse + change
-    return Solved(Solution((x, y, spin), guess.twist, impulse), answer, unknown)
+    return Solved(Solution((x, y, spin), guess.twist, impulse), unknown)
 
 
 def coupled(end: Rows, push: Rows, columns: tuple) -> Float[Array, "row row lane"]:
