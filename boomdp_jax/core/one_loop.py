@@ -31,7 +31,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.interpreters import ad, batching, mlir
 
-from boomdp_jax.core.scalar_parts import parts_of
+from boomdp_jax.core.loop_code import (
+    by_reduction,
+    by_vmap,
+    common_shape,
+    is_applied_once,
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -57,9 +62,16 @@ _one_loop_p.multiple_results = True
 
 
 def one_loop(
-    function: Callable[..., Any], *arguments: Any, static: tuple[Hashable, ...] = ()
+    function: Callable[..., Any],
+    *arguments: Any,
+    static: tuple[Hashable, ...] = (),
+    num_passed: int = 0,
 ) -> Any:
     """Apply a function of scalars, as one loop wherever it is batched.
+
+    Where many calls share an argument a reverse pass adds up what each gives back for
+    it, a small loop for every sum. If each call takes the argument from the one before,
+    handed on unchanged (`num_passed`), they are added up within the loops of the calls.
 
     Args:
         function: from scalars to a tree of scalars, by arithmetic alone: no loop whose
@@ -68,10 +80,12 @@ def one_loop(
             remembered.
         arguments: trees of scalars of one floating type.
         static: what the function takes before its arguments, hashable.
+        num_passed: so many arguments, the first ones, are handed on.
 
     Returns:
-        What the function returns. Batched by `jax.vmap` like anything else, and
-        differentiable in both modes, any number of times.
+        What the function returns; and before it those arguments, if there are any that
+        are handed on. Batched by `jax.vmap` like anything else, and differentiable in
+        both modes, any number of times.
 
     Raises:
         TypeError: if an argument or a result is not a scalar of that type.
@@ -90,7 +104,14 @@ def one_loop(
     is_double = jnp.result_type(float) == jnp.float64
     body, tree_out = _traced(function, static, treedef, np.dtype(dtype), is_double)
     flat = [jnp.asarray(leaf, dtype) for leaf in leaves]
-    return jax.tree.unflatten(tree_out, _one_loop_p.bind(*flat, body=body))
+    handed_on, treedef_on = jax.tree.flatten(arguments[:num_passed])
+    passed = tuple(range(len(handed_on)))
+    out = _one_loop_p.bind(*flat, body=body, passed=passed)
+    num = len(body.jaxpr.out_avals)
+    result = jax.tree.unflatten(tree_out, out[:num])
+    if not num_passed:
+        return result
+    return (*jax.tree.unflatten(treedef_on, out[num:]), result)
 
 
 def elementwise(
@@ -166,41 +187,31 @@ def _jaxpr_of(function, dtypes):
 
 
 @_one_loop_p.def_abstract_eval
-def _shapes(*avals, body):
-    shape = _common_shape(avals)
-    return [jax.core.ShapedArray(shape, aval.dtype) for aval in body.jaxpr.out_avals]
-
-
-def _common_shape(arrays) -> tuple[int, ...]:
-    """The one shape of all that are not scalars."""
-    shapes = {tuple(a.shape) for a in arrays} - {()}
-    if len(shapes) > 1:
-        raise TypeError(f"one_loop got arrays of different shapes: {sorted(shapes)}")
-    return shapes.pop() if shapes else ()
+def _shapes(*avals, body, passed):
+    """Of the results, and of the arguments that are handed on."""
+    shape = common_shape(avals)
+    results = [jax.core.ShapedArray(shape, aval.dtype) for aval in body.jaxpr.out_avals]
+    return [*results, *(avals[i] for i in passed)]
 
 
 @functools.lru_cache(maxsize=256)
-def _parts(body):
-    return parts_of(body.jaxpr)
-
-
-@functools.lru_cache(maxsize=256)
-def _compiled(body):
+def _compiled(body, passed):
     def run(*arguments):
         if any(isinstance(a, jax.core.Tracer) for a in arguments):
-            return _one_loop_p.bind(*arguments, body=body)
+            return _one_loop_p.bind(*arguments, body=body, passed=passed)
         # Compilation is switched off.
-        return [jnp.asarray(leaf) for leaf in _by_vmap(*arguments, body=body)]
+        out = by_vmap(*arguments, body=body, passed=passed)
+        return [jnp.asarray(leaf) for leaf in out]
 
     return jax.jit(run)
 
 
 @_one_loop_p.def_impl
-def _run(*arguments, body):
-    return _compiled(body)(*arguments)
+def _run(*arguments, body, passed):
+    return _compiled(body, passed)(*arguments)
 
 
-def _batched(arguments: Sequence, dims: Sequence, *, body):
+def _batched(arguments: Sequence, dims: Sequence, *, body, passed):
     """Scalars that are not batched stay scalars; everything else gets one shape."""
     size = next(
         a.shape[d] for a, d in zip(arguments, dims, strict=True) if d is not None
@@ -209,7 +220,7 @@ def _batched(arguments: Sequence, dims: Sequence, *, body):
         a if d is None else jnp.moveaxis(a, d, 0)
         for a, d in zip(arguments, dims, strict=True)
     ]
-    inner = _common_shape(
+    inner = common_shape(
         [
             jax.ShapeDtypeStruct(a.shape if d is None else a.shape[1:], a.dtype)
             for a, d in zip(moved, dims, strict=True)
@@ -224,8 +235,13 @@ def _batched(arguments: Sequence, dims: Sequence, *, body):
         return jnp.broadcast_to(array, (size, *inner))
 
     spreads = [spread(a, d is not None) for a, d in zip(moved, dims, strict=True)]
-    out = _one_loop_p.bind(*spreads, body=body)
-    return out, [0] * len(out)
+    # What had to be spread for this is handed on as it was, from here.
+    inside = [i for i in passed if spreads[i].shape == moved[i].shape]
+    out = _one_loop_p.bind(*spreads, body=body, passed=tuple(inside))
+    num = len(out) - len(inside)
+    handed_on = dict(zip(inside, out[num:], strict=True))
+    out = out[:num] + [handed_on.get(i, moved[i]) for i in passed]
+    return out, [0] * num + [None if dims[i] is None else 0 for i in passed]
 
 
 batching.primitive_batchers[_one_loop_p] = _batched
@@ -252,27 +268,39 @@ def _tangent(body: _Body, active: tuple[int, ...]) -> _Body:
 
 
 @functools.lru_cache(maxsize=256)
-def _transposed(body: _Body, present: tuple[int, ...]) -> _Body:
-    """From other arguments and cotangents of some results to those of linear ones."""
+def _transposed(
+    body: _Body, present: tuple[int, ...], added: tuple[int, ...] = ()
+) -> _Body:
+    """From other arguments and cotangents of some results to those of linear ones.
+
+    To those of the linear arguments that `added` counts up others are added, which come
+    last.
+    """
     dtypes = body.dtypes
     num = len(dtypes) - body.num_linear
+    given = [body.jaxpr.out_avals[i].dtype for i in present]
 
     def transposed(*values):
-        others, cotangents = values[:num], list(values[num:])
+        others, values = values[:num], values[num:]
+        cotangents, more = list(values[: len(present)]), values[len(present) :]
 
         def linear(*chosen):
             out = body.function(*others, *chosen)
             return [out[i] for i in present]
 
         shapes = [jax.ShapeDtypeStruct((), dtype) for dtype in dtypes[num:]]
-        return list(jax.linear_transpose(linear, *shapes)(cotangents))
+        out = list(jax.linear_transpose(linear, *shapes)(cotangents))
+        for i, value in zip(added, more, strict=True):
+            out[i] = out[i] + value
+        return out
 
-    given = [body.jaxpr.out_avals[i].dtype for i in present]
-    return _Body(_jaxpr_of(transposed, dtypes[:num] + given), num_linear=len(present))
+    dtypes_in = dtypes[:num] + given + [dtypes[num + i] for i in added]
+    return _Body(_jaxpr_of(transposed, dtypes_in), len(given) + len(added))
 
 
-def _jvp(primals, tangents, *, body):
-    out = _one_loop_p.bind(*primals, body=body)
+def _jvp(primals, tangents, *, body, passed):
+    out = _one_loop_p.bind(*primals, body=body, passed=passed)
+    num_results = len(out) - len(passed)
     active = tuple(i for i, t in enumerate(tangents) if type(t) is not ad.Zero)
     first = len(primals) - body.num_linear
     if active[0] >= first:
@@ -281,35 +309,61 @@ def _jvp(primals, tangents, *, body):
             jnp.zeros((), p.dtype) if type(t) is ad.Zero else t
             for p, t in zip(primals[first:], tangents[first:], strict=True)
         ]
-        moved = _one_loop_p.bind(*primals[:first], *rates, body=body)
+        arguments, tangent = [*primals[:first], *rates], body
+        places = {i: i for i in active}
     else:
         rates = [tangents[i] for i in active]
-        moved = _one_loop_p.bind(*primals, *rates, body=_tangent(body, active))
+        arguments, tangent = [*primals, *rates], _tangent(body, active)
+        places = {i: len(primals) + k for k, i in enumerate(active)}
+    moving = [k for k, i in enumerate(passed) if i in places]
+    passed_on = tuple(places[passed[k]] for k in moving)
+    moved = _one_loop_p.bind(*arguments, body=tangent, passed=passed_on)
     # Tangents of a batch's scalars may be scalars still.
-    return out, [
-        m if m.shape == o.shape else jnp.broadcast_to(m, o.shape)
-        for m, o in zip(moved, out, strict=True)
-    ]
+    rates_out: list = [ad.Zero(jax.typeof(o).to_tangent_aval()) for o in out]
+    for i, m in enumerate(moved[:num_results]):
+        shape = out[i].shape
+        rates_out[i] = m if m.shape == shape else jnp.broadcast_to(m, shape)
+    for k, m in zip(moving, moved[num_results:], strict=True):
+        rates_out[num_results + k] = m
+    return out, rates_out
 
 
 ad.primitive_jvps[_one_loop_p] = _jvp
 
 
-def _transpose(cotangents, *arguments, body):
+def _transpose(cotangents, *arguments, body, passed):
     num = len(arguments) - body.num_linear
     others, linear = arguments[:num], arguments[num:]
-    present = tuple(i for i, ct in enumerate(cotangents) if type(ct) is not ad.Zero)
-    if not present:
-        return [
-            ad.Zero(a.aval) if ad.is_undefined_primal(a) else None for a in arguments
+    num_results = len(body.jaxpr.out_avals)
+    present = tuple(
+        i for i, ct in enumerate(cotangents[:num_results]) if type(ct) is not ad.Zero
+    )
+    # What linear arguments that are handed on get back from there.
+    back = {
+        i - num: ct
+        for i, ct in zip(passed, cotangents[num_results:], strict=True)
+        if type(ct) is not ad.Zero
+    }
+    out: list = [None] * len(linear)
+    if present:
+        shape = common_shape([*others, *(cotangents[i] for i in present)])
+        added = tuple(i for i in back if linear[i].aval.shape == shape)
+        given = [cotangents[i] for i in present] + [back.pop(i) for i in added]
+        transposed = _transposed(body, present, added)
+        out = _one_loop_p.bind(*others, *given, body=transposed, passed=())
+        out = [
+            # What went out to a whole batch comes back as a sum.
+            jnp.sum(ct)
+            if ad.is_undefined_primal(a) and ct.shape != a.aval.shape
+            else ct
+            for ct, a in zip(out, linear, strict=True)
         ]
-    given = [cotangents[i] for i in present]
-    out = _one_loop_p.bind(*others, *given, body=_transposed(body, present))
+    for i, ct in back.items():
+        out[i] = ct if out[i] is None else out[i] + ct
     return [None] * num + [
-        # What went out to a whole batch comes back as a sum.
-        (jnp.sum(ct) if ct.shape != tuple(a.aval.shape) else ct)
-        if ad.is_undefined_primal(a)
-        else None
+        None
+        if not ad.is_undefined_primal(a)
+        else (ad.Zero(a.aval) if ct is None else ct)
         for ct, a in zip(out, linear, strict=True)
     ]
 
@@ -317,79 +371,10 @@ def _transpose(cotangents, *arguments, body):
 ad.primitive_transposes[_one_loop_p] = _transpose
 
 
-def _by_vmap(*arguments, body):
-    """As everywhere else in JAX."""
-    shape = _common_shape(arguments)
-    if not shape:
-        return body.function(*arguments)
-    flat = [a.reshape(-1) if a.shape else a for a in arguments]
-    axes = tuple(0 if a.shape else None for a in arguments)
-    out = jax.vmap(body.function, axes, axis_size=int(np.prod(shape)))(*flat)
-    return [leaf.reshape(shape) for leaf in out]
-
-
-def _by_reduction(*arguments, body):
-    """As functions of windowed reductions."""
-    shape, values, out = _common_shape(arguments), list(arguments), []
-    for part in _parts(body):
-        out = _reduction(
-            part.function, [values[i] for i in part.inputs], part.num_outputs
-        )
-        values += out
-    # A result that depends on scalars alone is one.
-    return [jnp.broadcast_to(leaf, shape) for leaf in out]
-
-
-def _reduction(function, arguments: list, num_out: int) -> list:
-    """A function of a windowed reduction; scalars travel as initial values."""
-    shape, dtype = _common_shape(arguments), arguments[0].dtype
-    is_array = [bool(a.shape) for a in arguments]
-    arrays = [a.reshape(-1) for a in arguments if a.shape]
-    scalars = [a for a in arguments if not a.shape]
-    num_slots = max(len(arrays), len(scalars), num_out)
-    spare = arrays[0] if arrays else jnp.zeros((1,), dtype)
-    zero = jnp.zeros((), dtype)
-    arrays += [spare] * (num_slots - len(arrays))
-    scalars += [zero] * (num_slots - len(scalars))
-
-    def apply(initial, element):
-        sources = {True: iter(element), False: iter(initial)}
-        out = function(*(next(sources[is_one]) for is_one in is_array))
-        return (*out, *(jnp.zeros((), dtype),) * (num_slots - num_out))
-
-    out = jax.lax.reduce_window(
-        tuple(arrays), tuple(scalars), apply, (1,), (1,), "VALID"
-    )
-    return [leaf.reshape(shape) for leaf in out[:num_out]]
-
-
-@functools.cache
-def _is_applied_once() -> bool:
-    """Whether the CPU backend applies the function of a reduction as is needed here."""
-    first, second = np.array([[1.0, 2.0, -3.0], [0.5, -4.0, 7.0]], np.float32)
-
-    def apply(initial, element):
-        return initial[0] - 2.0 * element[0] * element[1], initial[1] + element[1] ** 3
-
-    def reduce(first, second, start):
-        return jax.lax.reduce_window(
-            (first, second), (start, 2.0 * start), apply, (1,), (1,), "VALID"
-        )
-
-    expected = (5.0 - 2.0 * first * second, 10.0 + second**3)
-    with (
-        jax.ensure_compile_time_eval(),
-        jax.disable_jit(False),
-        jax.default_device(jax.devices("cpu")[0]),
-    ):
-        found = jax.jit(reduce)(first, second, np.float32(5.0))
-        return all(np.array_equal(f, e) for f, e in zip(found, expected, strict=True))
-
-
 def _on_cpu(context, *arguments, **params):
-    rule = _by_reduction if _is_applied_once() else _by_vmap
+    rule = by_reduction if is_applied_once() else by_vmap
     return mlir.lower_fun(rule, multiple_results=True)(context, *arguments, **params)
 
 
-mlir.register_lowering(_one_loop_p, mlir.lower_fun(_by_vmap, multiple_results=True))
+mlir.register_lowering(_one_loop_p, mlir.lower_fun(by_vmap, multiple_results=True))
 mlir.register_lowering(_one_loop_p, _on_cpu, platform="cpu")

@@ -40,6 +40,7 @@ from boomdp_jax.physics.contact_step import (
     moved_with,
     part_all,
     settle_all,
+    sweeping,
     touching,
 )
 from boomdp_jax.physics.contact_world import each_round
@@ -97,10 +98,10 @@ def coupled_substep(
     sums, impulses = touch.sums, touch.impulses
     # Under the impulses of the substep before.
     solved = solve_velocity(_pushed(problem, sums))
-    is_settled, twists = solved.is_settled, solved.solution.twist
+    twists = solved.solution.twist
     ease = _ease(problem, _sure_answer(problem, twists))
     eases = each_round(ease, num_bodies)
-    rate = 1.0 / prepared.length
+    sweep, meetings = sweeping(contacts, eases, prepared.length), []
 
     def answered(before: Solved, old: tuple, sums: tuple) -> Solved:
         """Friction and joints under the impulses of contacts."""
@@ -108,21 +109,19 @@ def coupled_substep(
         has_changed = functools.reduce(jnp.logical_or, changes)
         return solve_again(_pushed(problem, sums), before.solution, has_changed)
 
-    before = tuple(motion[3:])
+    before = moved, tuple(motion[3:])
     for _ in range(num_sweeps):
-        both, impulses = part_all(
-            contacts, eases, rate, (moved, before), (*twists, *sums), impulses
+        sweep, both, impulses, meetings = part_all(
+            sweep, before, (*twists, *sums), impulses
         )
         solved, sums = answered(solved, sums, both[3:]), both[3:]
         twists = solved.solution.twist
     touches = touching(contacts, [problem.mobile / problem.mass * p for p in sums])
     place = moved_with(motion, touches, twists, prepared.length)
-    both, impulses = settle_all(
-        contacts, eases, rate, before, (*twists, *sums), impulses
-    )
+    both, impulses = settle_all(sweep, meetings, (*twists, *sums), impulses)
     solved, sums = answered(solved, sums, both[3:]), both[3:]
     final = Motion(*place, *solved.solution.twist)
-    final = projected(prepared, problem, is_settled, force, motion, final)
+    final = projected(prepared, problem, solved.is_settled, force, motion, final)
     return final, Touch(impulses, sums)
 
 

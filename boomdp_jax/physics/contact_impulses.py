@@ -74,7 +74,7 @@ def part(
     given: tuple[tuple[Twist, Twist], tuple[Twist, Twist]],
     twists: tuple[tuple, tuple],
     impulses: list[Impulse],
-) -> tuple[tuple[tuple, tuple], list[Impulse]]:
+) -> tuple[tuple[tuple, tuple], list[Impulse], list[FloatScalar]]:
     """Put a contact right so that nothing overlaps at the end of the substep.
 
     Args:
@@ -87,13 +87,15 @@ def part(
         impulses: so far.
 
     Returns:
-        Twists and impulses.
+        Twists, impulses, and the speeds at which surfaces parted at both points when
+        the substep began.
     """
     (moved_a, before_a), (moved_b, before_b) = given
     moved, before = (moved_a, moved_b), (before_a, before_b)
+    meeting = [_approach(rows, row, before) for row in rows.points]
 
-    def demand(row: Row, normal, speed) -> _Demand:
-        shift = jnp.zeros_like(normal)
+    def demand(i: int, normal, speed) -> _Demand:
+        row, shift = rows.points[i], jnp.zeros_like(normal)
         for side, sign in ((0, -1.0), (1, 1.0)):
             x, y, angle = moved[side]
             turned = row.normal_arms[side] * angle
@@ -101,12 +103,14 @@ def part(
             shift = shift + sign * (rows.normal[0] * x + rows.normal[1] * y + turned)
         slack = pace.rate * (row.separation + shift)
         bias, kept = _softened(slack, pace.smoothing)
-        own = _approach(rows, row, before)
-        waits, parts = _put_off(rows, row, own, speed, slack, pace.rate)
+        waits, parts = _put_off(rows, row, meeting[i], speed, slack, pace.rate)
         counts = (1.0 - waits) * (1.0 - parts)
         return _Demand(-bias, jnp.where(counts > 0.0, kept, 1.0 - parts), counts)
 
-    return _swept(rows, eases, pace, twists, impulses, demand, is_rubbing_last=False)
+    twists, impulses = _swept(
+        rows, eases, pace, twists, impulses, demand, is_rubbing_last=False
+    )
+    return twists, impulses, meeting
 
 
 def _softened(slack: FloatScalar, smoothing: FloatScalar | None) -> tuple:
@@ -134,10 +138,10 @@ def _smooth_plus(value: FloatScalar, size: FloatScalar) -> FloatScalar:
 
 
 def settle(
+    pace: Pace,
     rows: Rows,
     eases: tuple[Ease, Ease],
-    pace: Pace,
-    before: tuple[Twist, Twist],
+    meeting: list[FloatScalar],
     twists: tuple[tuple, tuple],
     impulses: list[Impulse],
 ) -> tuple[tuple[tuple, tuple], list[Impulse]]:
@@ -147,10 +151,10 @@ def settle(
     alone.
 
     Args:
+        pace: length of the substep and smoothing.
         rows: the contact.
         eases: of both bodies.
-        pace: length of the substep and smoothing.
-        before: twists of both when the substep began.
+        meeting: speeds at which surfaces parted when the substep began.
         twists: of both; numbers after the third are sums of impulses.
         impulses: so far.
 
@@ -158,8 +162,8 @@ def settle(
         Twists and impulses.
     """
 
-    def demand(row: Row, normal, speed) -> _Demand:
-        met = _approach(rows, row, before)
+    def demand(i: int, normal, speed) -> _Demand:
+        row, met = rows.points[i], meeting[i]
         bounce = jnp.where(met < -_REST_SPEED, -rows.restitution * met, 0.0)
         waits, _ = _put_off(rows, row, met, speed, jnp.zeros_like(normal), pace.rate)
         if pace.smoothing is None:
@@ -265,10 +269,7 @@ def _swept(
             change(i, above - below - limit)
 
     def press() -> None:
-        demands = [
-            demand(row, totals[2 + i], speeds[2 + i])
-            for i, row in enumerate(rows.points)
-        ]
+        demands = [demand(i, totals[2 + i], speeds[2 + i]) for i in range(2)]
         new = _normals(
             [g * d.counts for g, d in zip(gains[2:], demands, strict=True)],
             _coupling(a, b, direction, arms, 2, 3),

@@ -23,10 +23,17 @@ from jaxtyping import Array, Float
 
 from boomdp_jax.core.one_loop import one_loop
 from boomdp_jax.physics.contact_impulses import Pace, part, settle
-from boomdp_jax.physics.contact_rows import Ease, Rows, Side, add_pushes, begin
+from boomdp_jax.physics.contact_rows import (
+    Ease,
+    Rows,
+    Side,
+    Start,
+    add_pushes,
+    begin,
+)
 from boomdp_jax.physics.contact_world import ContactWorld, Fixed
 from boomdp_jax.physics.motion import Motion
-from boomdp_jax.physics.tournament import Halves, moved_on, num_seats, seated, unseated
+from boomdp_jax.physics.tournament import Halves, moved_on, seated, unseated
 from boomdp_jax.physics.trigonometry import heading_turn
 
 NUM_POINTS = 2
@@ -34,6 +41,8 @@ NUM_POINTS = 2
 
 Impulses = list[list[tuple]]
 """Of each round's pairs: normal and tangential, of both points; `[pair, lane]`."""
+Meetings = list[list]
+"""Of each round's pairs: speed at which surfaces part, at both points."""
 
 
 class Contacts(NamedTuple):
@@ -63,9 +72,13 @@ class _Pose(NamedTuple):
     corner_y: list
 
 
-def over_pairs(function, *arguments):
-    """Apply a function of scalars along pairs and lanes, in one loop."""
-    return jax.vmap(jax.vmap(lambda *scalars: one_loop(function, *scalars)))(*arguments)
+def over_pairs(function, *arguments, num_passed: int = 0):
+    """Apply a function of scalars along pairs and lanes (`one_loop`)."""
+
+    def apply(*scalars):
+        return one_loop(function, *scalars, num_passed=num_passed)
+
+    return jax.vmap(jax.vmap(apply))(*arguments)
 
 
 def find_contacts(
@@ -97,91 +110,120 @@ def find_contacts(
     for fixed, eases, allowed, before in zip(
         world.fixed, world.eases, world.allowed, impulses, strict=True
     ):
-        start = over_pairs(_begin, *fixed, *halves, allowed, before, *eases)
+        *handed_on, (start, sums) = over_pairs(
+            _begin, halves, fixed, allowed, eases, before, sums, num_passed=1
+        )
         rows.append(start.rows)
         kept.append(start.impulses)
         nearest.append(jnp.min(start.separation, axis=0))
-        sums = over_pairs(add_pushes, start.rows, start.impulses, sums)
-        halves, sums = moved_on(halves), moved_on(sums)
+        halves, sums = moved_on(handed_on[0]), moved_on(sums)
     overlap = jnp.maximum(-functools.reduce(jnp.minimum, nearest), 0.0)
     contacts = Contacts(rows, overlap, world.smoothing)
     return contacts, Touch(kept, unseated(sums, num_bodies))
 
 
 def _begin(
-    fixed_a: Fixed, fixed_b: Fixed, pose_a, pose_b, allowed, impulses, ease_a, ease_b
-):
-    return begin(
-        Side(*pose_a, *fixed_a, ease_a),
-        Side(*pose_b, *fixed_b, ease_b),
-        allowed,
-        impulses,
-    )
+    pose: Halves,
+    fixed: tuple[Fixed, Fixed],
+    allowed,
+    eases: tuple[Ease, Ease],
+    impulses,
+    sums: tuple,
+) -> tuple[Start, tuple]:
+    a, b = (Side(*p, *f, e) for p, f, e in zip(pose, fixed, eases, strict=True))
+    start = begin(a, b, allowed, impulses)
+    return start, add_pushes(start.rows, start.impulses, sums)
 
 
-def part_all(
-    contacts: Contacts,
-    eases: list[Halves],
-    rate: Float[Array, " lane"],
-    given: tuple[tuple, tuple],
-    twists: tuple,
-    impulses: Impulses,
-) -> tuple[tuple, Impulses]:
-    """Sweep once over all contacts before bodies are moved (`contact_impulses.part`).
+class Sweeping(NamedTuple):
+    """What sweeps over contacts are given, and hand on (`one_loop`)."""
+
+    rows: list[Rows]
+    eases: list[Halves]
+    """Of both bodies of each pair, round by round."""
+    pace: Pace
+    """`[pair, lane]`."""
+
+
+def sweeping(
+    contacts: Contacts, eases: list[Halves], length: Float[Array, " lane"]
+) -> Sweeping:
+    """Gather what sweeps of a substep are given.
 
     Args:
         contacts: of this step.
         eases: of both bodies of each pair, round by round.
-        rate: one over the length of the substep [1/s].
-        given: displacement of every body in this step, and its twist when the substep
+        length: of the substep [s].
+
+    Returns:
+        All of it.
+    """
+    num_pairs = contacts.rows[0].friction.shape[0]
+    pace = jax.tree.map(
+        lambda one: jnp.broadcast_to(one[None], (num_pairs, *one.shape)),
+        Pace(1.0 / length, contacts.smoothing),
+    )
+    return Sweeping(contacts.rows, eases, pace)
+
+
+def part_all(
+    given: Sweeping, before: tuple[tuple, tuple], twists: tuple, impulses: Impulses
+) -> tuple[Sweeping, tuple, Impulses, Meetings]:
+    """Sweep once over all contacts before bodies are moved (`contact_impulses.part`).
+
+    Args:
+        given: contacts, and what bodies answer.
+        before: displacement of every body in this step, and its twist when the substep
             began.
         twists: of every body; numbers after the third are sums of impulses.
         impulses: so far.
 
     Returns:
-        Twists and impulses.
+        What was given, twists, impulses, and the speeds at which surfaces met.
     """
-    return _sweep(part, contacts, eases, rate, given, twists, impulses)
+    num_bodies, pace = twists[0].shape[0], given.pace
+    halves, known = seated(twists, num_bodies), seated(before, num_bodies)
+    rows, eases, after, meetings = [], [], [], []
+    for row, ease, old in zip(given.rows, given.eases, impulses, strict=True):
+        *handed_on, (halves, new, met) = over_pairs(
+            part, row, ease, pace, known, halves, old, num_passed=4
+        )
+        row, ease, pace, known = handed_on
+        _append((rows, row), (eases, ease), (after, new), (meetings, met))
+        halves, known = moved_on(halves), moved_on(known)
+    return Sweeping(rows, eases, pace), unseated(halves, num_bodies), after, meetings
 
 
 def settle_all(
-    contacts: Contacts,
-    eases: list[Halves],
-    rate: Float[Array, " lane"],
-    before: tuple,
-    twists: tuple,
-    impulses: Impulses,
+    given: Sweeping, meetings: Meetings, twists: tuple, impulses: Impulses
 ) -> tuple[tuple, Impulses]:
     """Sweep over all contacts after bodies were moved (`contact_impulses.settle`).
 
     Args:
-        contacts: of this step.
-        eases: of both bodies of each pair, round by round.
-        rate: one over the length of the substep [1/s].
-        before: twists of every body when the substep began.
+        given: contacts, and what bodies answer.
+        meetings: speeds at which surfaces met as the substep began.
         twists: of every body; numbers after the third are sums of impulses.
         impulses: so far.
 
     Returns:
         Twists and impulses.
     """
-    return _sweep(settle, contacts, eases, rate, before, twists, impulses)
+    num_bodies, pace, after = twists[0].shape[0], given.pace, []
+    halves = seated(twists, num_bodies)
+    for row, ease, met, old in zip(
+        given.rows, given.eases, meetings, impulses, strict=True
+    ):
+        pace, (halves, new) = over_pairs(
+            settle, pace, row, ease, met, halves, old, num_passed=1
+        )
+        after.append(new)
+        halves = moved_on(halves)
+    return unseated(halves, num_bodies), after
 
 
-def _sweep(function, contacts, eases, rate, given, twists, impulses):
-    """Round after round, with what of each body is given and what is changed."""
-    num_bodies, after = twists[0].shape[0], []
-    num_pairs = num_seats(num_bodies) // 2
-    pace = jax.tree.map(
-        lambda one: jnp.broadcast_to(one[None], (num_pairs, *one.shape)),
-        Pace(rate, contacts.smoothing),
-    )
-    twists, given = seated(twists, num_bodies), seated(given, num_bodies)
-    for rows, ease, before in zip(contacts.rows, eases, impulses, strict=True):
-        twists, impulse = over_pairs(function, rows, ease, pace, given, twists, before)
-        after.append(impulse)
-        twists, given = moved_on(twists), moved_on(given)
-    return unseated(twists, num_bodies), after
+def _append(*pairs: tuple[list, Any]) -> None:
+    for values, value in pairs:
+        values.append(value)
 
 
 def contact_substep(
@@ -213,15 +255,14 @@ def contact_substep(
     """
     given = ease(touch.sums)
     start = tuple(v + dv for v, dv in zip(free, given, strict=True))
-    before, rate = tuple(motion[3:]), 1.0 / length
+    before = moved, tuple(motion[3:])
+    sweep, meetings = sweeping(contacts, eases, length), []
     twists, impulses = start, touch.impulses
     for _ in range(num_sweeps):
-        twists, impulses = part_all(
-            contacts, eases, rate, (moved, before), twists, impulses
-        )
+        sweep, twists, impulses, meetings = part_all(sweep, before, twists, impulses)
     changes = _changes(twists, free, given)
     place = moved_with(motion, touching(contacts, changes), twists, length)
-    final, impulses = settle_all(contacts, eases, rate, before, twists, impulses)
+    final, impulses = settle_all(sweep, meetings, twists, impulses)
     # What the impulses on a body sum up to follows from what they did to it.
     sums = tuple(
         jnp.where(e > 0.0, change / jnp.where(e > 0.0, e, 1.0), 0.0)

@@ -1,0 +1,103 @@
+"""What a function of scalars becomes over arrays (`one_loop`): one loop, or many."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from boomdp_jax.core.scalar_parts import parts_of
+
+
+def common_shape(arrays) -> tuple[int, ...]:
+    """The one shape of all arrays that are not scalars."""
+    shapes = {tuple(a.shape) for a in arrays} - {()}
+    if len(shapes) > 1:
+        raise TypeError(f"one_loop got arrays of different shapes: {sorted(shapes)}")
+    return shapes.pop() if shapes else ()
+
+
+@functools.lru_cache(maxsize=256)
+def _parts(body):
+    return parts_of(body.jaxpr)
+
+
+def by_vmap(*arguments, body, passed):
+    """Apply a body as everywhere else in JAX.
+
+    Args:
+        arguments: arrays of one shape, and scalars.
+        body: `one_loop`'s, a function of scalars.
+        passed: which arguments are handed on.
+
+    Returns:
+        The results, and the arguments that are handed on.
+    """
+    shape, handed_on = common_shape(arguments), [arguments[i] for i in passed]
+    if not shape:
+        return [*body.function(*arguments), *handed_on]
+    flat = [a.reshape(-1) if a.shape else a for a in arguments]
+    axes = tuple(0 if a.shape else None for a in arguments)
+    out = jax.vmap(body.function, axes, axis_size=int(np.prod(shape)))(*flat)
+    return [leaf.reshape(shape) for leaf in out] + handed_on
+
+
+def by_reduction(*arguments, body, passed):
+    """The same by functions of windowed reductions, given and returning the same."""
+    shape, values, out = common_shape(arguments), list(arguments), []
+    for part in _parts(body):
+        out = _reduction(
+            part.function, [values[i] for i in part.inputs], part.num_outputs
+        )
+        values += out
+    # A result that depends on scalars alone is one.
+    results = [jnp.broadcast_to(leaf, shape) for leaf in out]
+    return results + [arguments[i] for i in passed]
+
+
+def _reduction(function, arguments: list, num_out: int) -> list:
+    """A function of a windowed reduction; scalars travel as initial values."""
+    shape, dtype = common_shape(arguments), arguments[0].dtype
+    is_array = [bool(a.shape) for a in arguments]
+    # With a first axis of one: the backend adds an axis to a vector, in an order of
+    # its own, and copies the vector for that.
+    arrays = [a.reshape(1, -1) for a in arguments if a.shape]
+    scalars = [a for a in arguments if not a.shape]
+    num_slots = max(len(arrays), len(scalars), num_out)
+    spare = arrays[0] if arrays else jnp.zeros((1, 1), dtype)
+    zero = jnp.zeros((), dtype)
+    arrays += [spare] * (num_slots - len(arrays))
+    scalars += [zero] * (num_slots - len(scalars))
+
+    def apply(initial, element):
+        sources = {True: iter(element), False: iter(initial)}
+        out = function(*(next(sources[is_one]) for is_one in is_array))
+        return (*out, *(jnp.zeros((), dtype),) * (num_slots - num_out))
+
+    out = jax.lax.reduce_window(
+        tuple(arrays), tuple(scalars), apply, (1, 1), (1, 1), "VALID"
+    )
+    return [leaf.reshape(shape) for leaf in out[:num_out]]
+
+
+@functools.cache
+def is_applied_once() -> bool:
+    """Whether the CPU backend applies the function of a reduction as is needed here."""
+    first, second = np.array([[1.0, 2.0, -3.0], [0.5, -4.0, 7.0]], np.float32)
+
+    def apply(initial, element):
+        return initial[0] - 2.0 * element[0] * element[1], initial[1] + element[1] ** 3
+
+    def reduce(first, second, start):
+        return jax.lax.reduce_window(
+            (first, second), (start, 2.0 * start), apply, (1,), (1,), "VALID"
+        )
+
+    expected = (5.0 - 2.0 * first * second, 10.0 + second**3)
+    with (
+        jax.ensure_compile_time_eval(),
+        jax.disable_jit(False),
+        jax.default_device(jax.devices("cpu")[0]),
+    ):
+        found = jax.jit(reduce)(first, second, np.float32(5.0))
+        return all(np.array_equal(f, e) for f, e in zip(found, expected, strict=True))
