@@ -7,6 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from boomdp_jax.core.scalar_parts import parts_of
+from boomdp_jax.core.unmerged import one_by_sorting
+
+# Numbers in a vector from which a loop that it is worked out in should not be merged
+# (`unmerged`); of arrays of more axes whoever writes the loop knows best.
+_MANY = 8
 
 
 def common_shape(arrays) -> tuple[int, ...]:
@@ -59,12 +64,17 @@ def _reduction(function, arguments: list, num_out: int) -> list:
     """A function of a windowed reduction; scalars travel as initial values."""
     shape, dtype = common_shape(arguments), arguments[0].dtype
     is_array = [bool(a.shape) for a in arguments]
-    # With a first axis of one: the backend adds an axis to a vector, in an order of
-    # its own, and copies the vector for that.
-    arrays = [a.reshape(1, -1) for a in arguments if a.shape]
+    # What has several axes gets a first one of one: to a vector the backend adds an
+    # axis, in an order of its own, and copies for that what is no vector elsewhere.
+    flat = (-1,) if len(shape) < 2 else (1, -1)
+    arrays = [a.reshape(flat) for a in arguments if a.shape]
     scalars = [a for a in arguments if not a.shape]
     num_slots = max(len(arrays), len(scalars), num_out)
-    spare = arrays[0] if arrays else jnp.zeros((1, 1), dtype)
+    if len(shape) == 1 and shape[0] >= _MANY:
+        # A number more that nobody looks at.
+        scalars.append(one_by_sorting(sum(a[0] for a in arrays)))
+        num_slots = max(num_slots, len(scalars))
+    spare = arrays[0] if arrays else jnp.zeros((1,) * len(flat), dtype)
     zero = jnp.zeros((), dtype)
     arrays += [spare] * (num_slots - len(arrays))
     scalars += [zero] * (num_slots - len(scalars))
@@ -74,8 +84,9 @@ def _reduction(function, arguments: list, num_out: int) -> list:
         out = function(*(next(sources[is_one]) for is_one in is_array))
         return (*out, *(jnp.zeros((), dtype),) * (num_slots - num_out))
 
+    window = (1,) * len(flat)
     out = jax.lax.reduce_window(
-        tuple(arrays), tuple(scalars), apply, (1, 1), (1, 1), "VALID"
+        tuple(arrays), tuple(scalars), apply, window, window, "VALID"
     )
     return [leaf.reshape(shape) for leaf in out[:num_out]]
 

@@ -12,9 +12,10 @@ def unmerged(value: Float[Array, "..."]) -> Float[Array, "..."]:
 
     The CPU backend of jaxlib 0.12 (0.10 did not) writes loops as one function, however
     long their body is. For substeps of ten bodies in contact the compiler then takes
-    150 seconds instead of 18, and what it makes is four times slower. It does so only
-    with loops in which nothing is sorted: here two numbers are, which costs a
-    microsecond.
+    150 seconds instead of 18, and what it makes is four times slower; so is a loop over
+    the steps of many lone bodies, and ten times with wheels, since what is inside it is
+    no longer done for several of the batch at once. It does so only with loops in which
+    nothing is sorted: here two numbers are, which costs a microsecond.
 
     Args:
         value: what the loop changes; not a constant of it.
@@ -26,8 +27,20 @@ def unmerged(value: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def _sorted_along(value):
-    one = jnp.ones((), value.dtype)
+    return hold(value, one_by_sorting(value.reshape(-1)[0]))
+
+
+def one_by_sorting(number: Float[Array, ""]) -> Float[Array, ""]:
+    """One, as what a sort of two numbers yields: what `unmerged` is made of.
+
+    Args:
+        number: what the loop changes.
+
+    Returns:
+        One, which the compiler cannot foresee.
+    """
+    number = jax.lax.stop_gradient(number)
+    one = jnp.ones((), number.dtype)
     # Which of the two it is, the compiler cannot foresee; the first is always one.
-    first = jax.lax.stop_gradient(value.reshape(-1)[0])
-    pair = jnp.stack([jnp.where(first > 0.0, 3.0, 2.0).astype(value.dtype), one])
-    return hold(value, jax.lax.sort(pair)[0])
+    pair = jnp.stack([jnp.where(number > 0.0, 3.0, 2.0).astype(number.dtype), one])
+    return jax.lax.sort(pair)[0]

@@ -173,9 +173,26 @@ def test_it_is_one_loop_when_compiled():
         program = jax.jit(jax.vmap(lambda x, y, q: f({"x": x, "y": y}, q)))
         text = program.lower(*numbers).compile().as_text()
         lines = text[text.index("ENTRY") :].splitlines()
-        return sum(" fusion(" in line and "4096]" in line for line in lines)
+        return sum(" fusion(" in line and "f32[4096" in line for line in lines)
 
     assert loops(looped) == 1 < loops(chain)
+
+
+@pytest.mark.parametrize(("num", "is_sorted"), [(64, True), (4, False)])
+def test_loops_over_time_are_not_merged_for_many(num, is_sorted):
+    """A sort keeps the backend from writing them as one slow function (`unmerged`)."""
+
+    def run(place, force):
+        def advance(x, _):
+            out = jax.vmap(looped)({"x": x, "y": place["y"]}, force)
+            return 0.5 * out["gap"], out["product"]
+
+        return jax.lax.scan(advance, place["x"], None, length=6)[1]
+
+    x, y, force = (0.1 * jnp.arange(3 * num, dtype=jnp.float32)).reshape(3, num)
+    for function in (run, jax.grad(lambda p, f: jnp.sum(run(p, f)))):
+        text = jax.jit(function).lower({"x": x, "y": y}, force).compile().as_text()
+        assert (" sort(" in text) == is_sorted
 
 
 def test_traced_once_for_each_tree_of_arguments():
