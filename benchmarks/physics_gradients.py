@@ -25,7 +25,9 @@ from boomdp_jax.physics import rollout, state_from_array
 NUM_STEPS = 100
 SCENES = ("chain", "flying", "piling")
 # Steps over which derivatives are compared: later ones are as chaotic as the worlds.
-CHECKED_STEPS, CHECKED_WORLDS, STEP = 30, 4, 1e-6
+# Wide differences straddle jumps, where a contact begins a substep earlier: of 4 worlds
+# of boxes one does within a millionth of its densities.
+CHECKED_STEPS, CHECKED_WORLDS, STEP = 30, 4, 1e-8
 TOLERANCE, TARGET_RATIO, TARGET_COMPILE = 1e-4, 4.0, 15.0
 
 
@@ -66,7 +68,8 @@ def check(reporter: Reporter, case: Case) -> bool:
         expected = (high - low) / (2.0 * STEP)
         reverse = jax.jit(jax.grad(lambda d: mean(d, *rest)))(density)
         forward = jax.jit(lambda d, a: jax.jvp(value, (d,), (a,))[1])(density, along)
-    found = {"reverse": float(jnp.vdot(reverse, along)), "forward": float(forward)}
+    along_reverse = np.vdot(np.asarray(reverse), np.asarray(along))
+    found = {"reverse": float(along_reverse), "forward": float(forward)}
     is_right = True
     for mode, derivative in found.items():
         error = abs(derivative - expected) / abs(expected)
