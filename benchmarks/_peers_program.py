@@ -5,8 +5,8 @@ import statistics
 import time
 from collections.abc import Callable
 
-import jax
 import numpy as np
+from _timing import compiled
 
 from boomdp_jax.physics.scene_spec import SceneSpec
 
@@ -88,14 +88,8 @@ def compiled_program(
     Returns:
         The program; every result is computed in each run.
     """
-    start = time.perf_counter()
-    compiled = jax.jit(function).lower(*arguments).compile()
-    seconds = time.perf_counter() - start
-    return Program(
-        run=lambda: jax.block_until_ready(compiled(*arguments)),
-        states=lambda: read(compiled(*arguments)),
-        compile_seconds=seconds,
-    )
+    run, seconds = compiled(function, arguments)
+    return Program(run=run, states=lambda: read(run()), compile_seconds=seconds)
 
 
 def measure(program: Program, num_runs: int, limit: float) -> Timing:

@@ -1,5 +1,6 @@
 """What a benchmark prints: JSON lines for machines, a table for people."""
 
+import argparse
 import importlib.metadata
 import json
 import math
@@ -11,6 +12,24 @@ import jax
 
 _VERSIONS = ("boomdp_jax", "jax", "jaxlib", "numpyro", "numpy", "mujoco")
 _COLUMNS = ("case", "metric", "value", "unit", "n", "peer_value", "target", "met")
+
+
+def parser_of(text: str, quick: str = "under a minute") -> argparse.ArgumentParser:
+    """What all benchmarks understand on their command line.
+
+    Args:
+        text: docstring of the benchmark; its first line is shown.
+        quick: what is left of it with `--quick`.
+
+    Returns:
+        A parser that knows `--quick` and `--out`.
+    """
+    parser = argparse.ArgumentParser(description=text.split("\n")[0])
+    parser.add_argument("--quick", action="store_true", help=quick)
+    parser.add_argument(
+        "--out", type=pathlib.Path, help="write the JSON lines here as well"
+    )
+    return parser
 
 
 class Reporter:

@@ -5,17 +5,15 @@ on top, and with impulses forgotten from step to step. Nothing here is right or 
 the engine's choice stands in the first row, and `contact_impulses` says why.
 """
 
-import argparse
 import concurrent.futures
 import dataclasses
 import multiprocessing
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _report import Reporter
+from _report import Reporter, parser_of
 
 from boomdp_jax.physics import contact_impulses, empty_cache, scene_spec_from_dict, step
 
@@ -91,10 +89,7 @@ def run(setting: Setting, num_steps: int):
 
 def main() -> int:
     """Print how deep and how far it goes with each setting."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="under a minute")
-    parser.add_argument("--out", type=Path, help="write the JSON lines here as well")
-    arguments = parser.parse_args()
+    arguments = parser_of(__doc__).parse_args()
     reporter = Reporter(arguments.out)
     for setting in SETTINGS[:2] if arguments.quick else SETTINGS:
         with concurrent.futures.ProcessPoolExecutor(

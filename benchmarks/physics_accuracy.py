@@ -8,10 +8,8 @@ the less the better. Friction between bodies is zero in collisions; MuJoCo has n
 coefficient of restitution, Box2D takes none below 1 m/s.
 """
 
-import argparse
 import importlib
 import sys
-from pathlib import Path
 
 from _accuracy_case import Case
 from _accuracy_collisions import collision_cases
@@ -19,7 +17,7 @@ from _accuracy_friction import friction_cases
 from _accuracy_smooth import smooth_cases
 from _peers_program import Figure, Peer
 from _peers_table import OURS, print_lines
-from _report import Reporter
+from _report import Reporter, parser_of
 
 MODULES = ("ours", "mujoco", "pymunk", "box2d")
 
@@ -88,9 +86,7 @@ def print_case(case: Case, figures: dict[str, list[Figure]]) -> None:
 
 def main() -> int:
     """Run every engine on every scene."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="under a minute")
-    parser.add_argument("--out", type=Path, help="write the JSON lines here as well")
+    parser = parser_of(__doc__)
     parser.add_argument("--scene", default="", help="scenes whose name contains this")
     arguments = parser.parse_args()
     reporter = Reporter(arguments.out)

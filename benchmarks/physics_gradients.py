@@ -8,17 +8,15 @@ derivative along one direction, by both modes, beside central differences.
 Compile and run time are apart; a run is the fastest of several.
 """
 
-import argparse
 import dataclasses
 import statistics
-import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from _peers_scenes import Case, all_cases
-from _report import Reporter
+from _report import Reporter, parser_of
+from _timing import measure
 
 from boomdp_jax.physics import rollout, state_from_array
 
@@ -86,20 +84,6 @@ def check(reporter: Reporter, case: Case) -> bool:
     return is_right
 
 
-def measure(function, arguments, num_runs: int) -> tuple[float, list[float]]:
-    """Seconds to compile, and of each run."""
-    start = time.perf_counter()
-    program = jax.jit(function).lower(*arguments).compile()
-    compiled = time.perf_counter() - start
-    jax.block_until_ready(program(*arguments))
-    runs = []
-    for _ in range(num_runs):
-        start = time.perf_counter()
-        jax.block_until_ready(program(*arguments))
-        runs.append(time.perf_counter() - start)
-    return compiled, runs
-
-
 def time_case(reporter: Reporter, case: Case, batch: int, num_runs: int) -> None:
     """A forward run and its gradient, one after the other."""
     mean, arguments = problem(case, batch, NUM_STEPS, jnp.float32)
@@ -143,9 +127,7 @@ def time_case(reporter: Reporter, case: Case, batch: int, num_runs: int) -> None
 
 def main() -> int:
     """Check and time every scene."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="the chain only, batch 64")
-    parser.add_argument("--out", type=Path, help="write the JSON lines here as well")
+    parser = parser_of(__doc__, quick="the chain only, batch 64")
     parser.add_argument("--scene", default="", help="scenes whose name contains this")
     arguments = parser.parse_args()
     reporter, is_right = Reporter(arguments.out), True

@@ -15,18 +15,16 @@ is missing, or fails, is reported with its reason. A batch that would take longe
 `--limit` seconds a run is left out.
 """
 
-import argparse
 import contextlib
 import dataclasses
 import importlib
 import sys
 from collections.abc import Callable
-from pathlib import Path
 
 from _peers_program import Figure, Peer, measure
 from _peers_scenes import Case, all_cases
 from _peers_table import OURS, Row, find, print_lines, print_rows
-from _report import Reporter
+from _report import Reporter, parser_of
 
 MODULES = ("ours", "mujoco", "mjx", "brax", "jax2d", "pymunk", "box2d")
 JUDGED_BATCH = 64
@@ -189,9 +187,7 @@ def print_results(results: Results) -> None:
 
 def main() -> int:
     """Run every engine on every scene."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="under a minute")
-    parser.add_argument("--out", type=Path, help="write the JSON lines here as well")
+    parser = parser_of(__doc__)
     parser.add_argument("--only", default="", help="engines whose name contains this")
     parser.add_argument("--scene", default="", help="scenes whose name contains this")
     parser.add_argument("--limit", type=float, default=30.0, help="seconds a run")

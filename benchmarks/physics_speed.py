@@ -12,7 +12,6 @@ Peer: MuJoCo in C, the same body held by an equality joint on planar joints, ste
 `mujoco.rollout` on all cores (without the wheel, which MuJoCo does not have).
 """
 
-import argparse
 import json
 import os
 import statistics
@@ -25,7 +24,8 @@ import jax.numpy as jnp
 import mujoco
 import mujoco.rollout
 import numpy as np
-from _report import Reporter
+from _report import Reporter, parser_of
+from _timing import measure
 from scipy.integrate import solve_ivp
 
 from boomdp_jax.physics import Params, State, rollout
@@ -214,20 +214,6 @@ def checksum(scene, params, state, wrenches):
     return sum(jnp.mean(leaf.astype(jnp.float32)) for leaf in outputs)
 
 
-def measure(function, arguments, num_runs: int) -> tuple[float, list[float]]:
-    """Seconds to compile, and seconds of each run after a first one."""
-    start = time.perf_counter()
-    compiled = jax.jit(function).lower(*arguments).compile()
-    seconds_to_compile = time.perf_counter() - start
-    jax.block_until_ready(compiled(*arguments))
-    runs = []
-    for _ in range(num_runs):
-        start = time.perf_counter()
-        jax.block_until_ready(compiled(*arguments))
-        runs.append(time.perf_counter() - start)
-    return seconds_to_compile, runs
-
-
 MUJOCO_MODEL = f"""
 <mujoco>
   <option timestep="{DT}" gravity="0 0 0" integrator="implicitfast">
@@ -326,10 +312,7 @@ def time_gradient(reporter, scene, params, batches, num_runs) -> None:
 
 def main() -> int:
     """Check the answer, then time it."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="under a minute")
-    parser.add_argument("--out", type=Path, help="write the JSON lines here as well")
-    arguments = parser.parse_args()
+    arguments = parser_of(__doc__).parse_args()
     reporter = Reporter(arguments.out)
     scene, params = read_scene()
     is_right = check(reporter, scene, params, 8 if arguments.quick else 64)

@@ -8,16 +8,14 @@ cent of energy (kinetic at the start and what their fall set free). The same wor
 run without joints and without contact too.
 """
 
-import argparse
 import time
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from _random_worlds import NUM_BODIES, Kinds, World, draw_world
-from _report import Reporter
+from _report import Reporter, parser_of
 
 from boomdp_jax.physics import State, rollout
 
@@ -111,9 +109,7 @@ def report(reporter: Reporter, case: str, found: dict, seconds: float) -> None:
 
 def main() -> int:
     """Run all cases."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="under a minute")
-    parser.add_argument("--out", type=Path, help="write the JSON lines here as well")
+    parser = parser_of(__doc__)
     parser.add_argument("--num", type=int, default=16_384, help="worlds of each case")
     parser.add_argument("--case", default="", help="cases whose name contains this")
     parser.add_argument("--seed", type=int, default=0)

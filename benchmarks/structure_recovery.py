@@ -10,14 +10,13 @@ coverage; it is repeated in a second world with other laws of friction (contacts
 wheels, joints for the floor).
 """
 
-import argparse
 import itertools
 import time
 
 import jax
 import numpy as np
 from _information import log_mass_bound
-from _report import Reporter
+from _report import Reporter, parser_of
 from _scores import ObjectScore, score_object
 from numpyro.diagnostics import effective_sample_size, split_gelman_rubin
 
@@ -43,14 +42,12 @@ FEWEST_JUDGED = 25
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="one cell, 3 objects")
+    parser = parser_of(__doc__, quick="one cell, 3 objects")
     parser.add_argument("--objects", type=int, default=240, help="in the main cell")
     parser.add_argument("--main-only", action="store_true", help="no other cell")
     parser.add_argument("--families", nargs="+", choices=FAMILIES, default=FAMILIES)
     parser.add_argument("--batch", type=int, default=24, help="objects in one call")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", help="file for the JSON lines")
     arguments = parser.parse_args()
     reporter = Reporter(arguments.out)
     if arguments.quick:
