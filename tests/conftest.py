@@ -38,8 +38,10 @@ class Precision(NamedTuple):
         return single if self.bits == 32 else double
 
 
-@pytest.fixture(params=[32, 64], ids=["float32", "float64"])
+@pytest.fixture(
+    params=[32, pytest.param(64, marks=pytest.mark.slow)], ids=["float32", "float64"]
+)
 def precision(request: pytest.FixtureRequest) -> Iterator[Precision]:
-    """Run the test once on 32 bit floats and once on 64 bit ones."""
+    """Run the test once on 32 bit floats and, among slow ones, once on 64 bit ones."""
     with jax.enable_x64(request.param == 64):
         yield Precision(request.param)

@@ -121,7 +121,16 @@ def coupled_substep(
     both, impulses = settle_all(sweep, meetings, (*twists, *sums), impulses)
     solved, sums = answered(solved, sums, both[3:]), both[3:]
     final = Motion(*place, *solved.solution.twist)
-    final = projected(prepared, problem, solved.is_settled, force, motion, final)
+    final = projected(
+        prepared,
+        problem,
+        solved.is_settled,
+        force,
+        motion,
+        final,
+        # Smoothed contacts push before bodies touch.
+        is_closed=contacts.smoothing is None,
+    )
     return final, Touch(impulses, sums)
 
 

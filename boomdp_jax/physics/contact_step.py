@@ -9,7 +9,9 @@ Once a step contacts are found (`find_contacts`). A substep then
 3. moves bodies with the twists that result; those that touch nothing move with the mean
    of old and new twist, which is of second order;
 4. sweeps once more without what was added to part overlapping bodies: surfaces that
-   touched do not approach, and bounce where they met fast.
+   touched do not approach, and bounce where they met fast;
+5. takes so much of what contacts did that no energy comes of it (`contact_energy`);
+   not so if they are smoothed, since they then push before bodies touch.
 
 All arrays are in lanes (`core.lanes`).
 """
@@ -22,6 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.one_loop import one_loop
+from boomdp_jax.physics.contact_energy import without_gain
 from boomdp_jax.physics.contact_impulses import Pace, part, settle
 from boomdp_jax.physics.contact_rows import (
     Ease,
@@ -263,12 +266,15 @@ def contact_substep(
     changes = _changes(twists, free, given)
     place = moved_with(motion, touching(contacts, changes), twists, length)
     final, impulses = settle_all(sweep, meetings, twists, impulses)
+    after = final
+    if contacts.smoothing is None:
+        after = without_gain(ease, tuple(motion[3:]), free, final)
     # What the impulses on a body sum up to follows from what they did to it.
     sums = tuple(
         jnp.where(e > 0.0, change / jnp.where(e > 0.0, e, 1.0), 0.0)
         for change, e in zip(_changes(final, free, given), ease[:3], strict=True)
     )
-    return Motion(*place, *final), Touch(impulses, sums)
+    return Motion(*place, *after), Touch(impulses, sums)
 
 
 def _changes(twists: tuple, free: tuple, given: tuple) -> list:

@@ -6,9 +6,11 @@ A substep of length h, for every body at once:
 2. solve for the new twists: forces, friction and joint impulses at mid-step, joints
    holding at the end (`velocity_solve`);
 3. move with the mean of old and new twist;
-4. put joint drift right, in position and in velocity, weighted by mass (`projection`);
-   where a joint turned so far that none of this is right any more, no energy is left
-   that nothing brought (`general_step.projected`).
+4. put joint drift right, in position and in velocity, weighted by mass (`projection`).
+
+Substeps that turn bodies too far, linkages close to a dead centre and impacts with
+friction can come out with more energy than they had; what nothing brought is taken away
+again (`general_step.projected`, `contact_energy`).
 
 Second order for smooth motion; a single contact's viscous decay, its response to a
 constant force and dry sliding in a straight line are exact. Where a contact changes
@@ -125,6 +127,8 @@ def rollout(
 
     Under `vmap` on a CPU a batch of a multiple of 1,024 (float32) is up to a fifth
     slower than one of a few more or less: its arrays compete for the same cache lines.
+    With `out_axes=1` time stays in front, and nothing has to be turned round at the
+    end: 4,096 lone bodies then take a third less.
 
     Args:
         scene: outlines, feet, gravity.

@@ -54,6 +54,7 @@ def test_batch_is_what_each_lane_gives(block, monkeypatch):
     assert deep["moved"].shape == (7, 7, 3)
 
 
+@pytest.mark.slow
 def test_derivatives_in_both_modes_are_those_of_the_function():
     tree, weights, flags = _arguments(5, seed=1)
 

@@ -68,6 +68,7 @@ def turned(angles, x, y):
     return x, y
 
 
+@pytest.mark.slow
 def test_a_function_that_no_compiler_takes_whole():
     angles = tuple(0.1 + 1e-3 * i for i in range(1500))
     x, y = jax.random.normal(jax.random.key(0), (2, 16), jnp.float32)

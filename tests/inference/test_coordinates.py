@@ -41,6 +41,7 @@ def test_the_middle_of_the_coordinates_is_the_middle_of_the_prior():
     np.testing.assert_allclose(params.revolute.anchor_a, 0.0)
 
 
+@pytest.mark.slow
 def test_inactive_slots_hold_zeros_and_have_no_gradient():
     b = block()
     z = np.linspace(-1.0, 1.0, b.layout.dim)

@@ -151,10 +151,13 @@ def test_smoothing_tells_of_what_does_not_touch_yet():
     assert errors[2] < 1e-3
 
 
-def test_smoothing_pushes_with_its_square_over_the_gap():
+@pytest.mark.parametrize("is_pinned", [False, True])
+def test_smoothing_pushes_with_its_square_over_the_gap(is_pinned):
     gap, speed = 0.05, 0.01
     ends = [body(f"disc {i}", 0.1, (i * (0.2 + gap), 0.0, 0.0)) for i in range(2)]
-    spec = spec_of(*ends, gravity=(0.0, 0.0))
+    pin = {"type": "revolute", "a": "disc 0", "b": "world"}
+    pin |= {"anchor_a": [0.0, 0.0], "anchor_b": [0.0, 0.0]}
+    spec = spec_of(*ends, gravity=(0.0, 0.0), constraints=[pin] if is_pinned else [])
     scene, params, state = _smoothed(spec, speed)
     states, _ = jax.jit(rollout)(scene, params, state, jnp.zeros((3, 2, 3)))
     apart = float(states.twist[-1, 1, 0] - states.twist[-1, 0, 0])

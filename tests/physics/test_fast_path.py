@@ -204,6 +204,7 @@ def test_friction_is_solved_to_the_end():
     assert np.sum(difference > 1e-7) < 4, np.sort(difference)[-8:]
 
 
+@pytest.mark.slow
 def test_masks_that_are_off_leave_a_free_body():
     params, state, wrench = draws()
     off = jax.tree.map(

@@ -80,7 +80,13 @@ def forward(numbers, direction, scene, params):
     return jax.jvp(lambda n: end(n, scene, params), (numbers,), (direction,))[1]
 
 
-@pytest.mark.parametrize("name", CASES)
+def _cases(names, quick):
+    """Each compiles for ten seconds and more; some are enough for a quick look."""
+    slow = pytest.mark.slow
+    return [n if n in quick else pytest.param(n, marks=slow) for n in names]
+
+
+@pytest.mark.parametrize("name", _cases(CASES, ("free", "wheel")))
 def test_both_modes_agree_with_finite_differences(name):
     world, twist, push = CASES[name]
     numbers, params = numbers_of(world, twist, push)

@@ -86,6 +86,7 @@ def test_a_drawer_slides_down_its_guide_without_turning():
     assert np.max(np.asarray(info.constraint_error)) < 1e-9
 
 
+@pytest.mark.slow
 def test_dry_friction_of_a_guide_holds_or_slows_down():
     weight = MASS * GRAVITY * np.sin(SLOPE)
     states, _ = run(drawer(dry=0.25 * weight), 50)
@@ -105,6 +106,7 @@ def test_a_drawer_stops_at_the_end_of_its_range():
     assert np.max(np.asarray(info.constraint_error)) < 1e-9
 
 
+@pytest.mark.slow
 def test_a_motor_lifts_a_load_at_its_speed_or_not_at_all():
     def lift(force):
         guide = tie("prismatic", axis=0.5 * np.pi, motor_speed=0.3, motor_force=force)
@@ -203,6 +205,7 @@ def test_inactive_slots_change_nothing():
     assert float(jnp.max(info.constraint_error)) == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_derivatives_of_a_drawer(mode):
     spec = drawer(viscous=0.8)

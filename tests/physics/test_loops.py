@@ -2,10 +2,13 @@
 
 import itertools
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from boomdp_jax.physics import State, rollout, scene_spec_from_dict
 from tests.physics.scenes import convergence_orders, run
 from tests.reference.planar_dynamics import (
     Pin,
@@ -149,3 +152,66 @@ def test_redundant_pins_hold_a_body_still(precision):
     assert trajectory.is_finite.all()
     np.testing.assert_allclose(trajectory.pose[-1, 0], 0.0, atol=1e-4)
     np.testing.assert_allclose(trajectory.twist[-1, 0], 0.0, atol=1e-3)
+
+
+def test_a_heavy_piston_drives_a_light_crank_through_dead_centre_for_nothing():
+    """All energy is in the crank there, and more steps than there are would show it."""
+    crank, rod, angle = 0.2, 0.5, 1.0
+    reach = np.sqrt(rod**2 - (crank * np.sin(angle)) ** 2)
+    tip = crank * np.array([np.cos(angle), np.sin(angle)])
+
+    def box(name, half_extents, pose):
+        shape = {"type": "box", "half_extents": half_extents}
+        return {"name": name, "shape": shape, "pose": pose, "density": 20.0}
+
+    def tie(kind, a, b, at_a, **more):
+        return {"type": kind, "a": a, "b": b, "anchor_a": at_a, **more}
+
+    origin = [0.0, 0.0]
+    spec = scene_spec_from_dict(
+        {
+            "schema": "planar-scene-1",
+            "gravity": origin,
+            "dt": 0.02,
+            "bodies": [
+                box("crank", [0.5 * crank, 0.01], [*(0.5 * tip), angle]),
+                box("piston", [0.4, 0.3], [tip[0] + reach, 0.0, 0.0]),
+            ],
+            "constraints": [
+                tie("revolute", "crank", "world", [-0.5 * crank, 0.0], anchor_b=origin),
+                tie(
+                    *("distance", "crank", "piston", [0.5 * crank, 0.0]),
+                    anchor_b=origin,
+                    length=rod,
+                ),
+                tie(
+                    *("prismatic", "piston", "world", origin),
+                    anchor_b=origin,
+                    axis=0.0,
+                    angle=0.0,
+                ),
+            ],
+        }
+    )
+    spins = np.linspace(0.5, 20.0, 200)
+    twist = np.zeros((200, 2, 3))
+    twist[:, 0] = spins[:, None] * [-0.5 * tip[1], 0.5 * tip[0], 1.0]
+    twist[:, 1, 0] = -spins * tip[1] * (1.0 + tip[0] / reach)
+    scene, params = spec.scene, spec.params()
+    mass = np.asarray(params.density * scene.area)
+    inertia = mass * np.asarray(scene.gyration)
+
+    def kinetic(twist):
+        square = np.asarray(twist) ** 2
+        linear = mass * (square[..., 0] + square[..., 1])
+        return 0.5 * np.sum(linear + inertia * square[..., 2], axis=-1)
+
+    pose = jnp.broadcast_to(spec.initial_state().pose, twist.shape)
+    start = State(pose, jnp.asarray(twist))
+    wrenches = jnp.zeros((200, 2, 3))
+    states, _ = jax.jit(
+        jax.vmap(lambda state: rollout(scene, params, state, wrenches))
+    )(start)
+    ratio = kinetic(states.twist) / kinetic(twist)[:, None]
+    assert np.max(ratio) < 1.02
+    assert np.all(np.isfinite(ratio))

@@ -96,6 +96,7 @@ def test_a_falling_body_keeps_its_energy_and_gains_its_weight_in_momentum():
     np.testing.assert_allclose(fallen, -9.81 * world.mass[0] * time, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_joined_bodies_keep_momentum_that_no_single_one_keeps():
     world = World(
         [(0.3, 0.1), (0.2, 0.05)],

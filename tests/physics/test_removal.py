@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from boomdp_jax.physics import Params, State, remove_bodies, rollout
 from boomdp_jax.physics.scene_spec import scene_spec_from_dict
@@ -54,6 +55,7 @@ def run(scene, params, state, num_steps=30):
     return rollout(scene, params, state, wrenches)[0].array
 
 
+@pytest.mark.slow
 def test_a_removed_body_is_not_there_and_nothing_is_traced_again():
     spec = make_spec(ALL)
     num_traces = 0
@@ -85,6 +87,7 @@ def test_a_removed_body_is_not_there_and_nothing_is_traced_again():
             )
 
 
+@pytest.mark.slow
 def test_a_removed_body_might_as_well_be_far_away():
     spec, gone = make_spec(ALL), ALL.index("low")
     scene, params = remove_bodies(

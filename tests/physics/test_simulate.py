@@ -74,6 +74,7 @@ def assert_has_scale(draws: np.ndarray, scale: float) -> None:
     assert abs(np.mean(draws)) < limit
 
 
+@pytest.mark.slow
 def test_without_noise_it_is_rollout():
     scene, params = make_scene(PAIR), make_params(PAIR)
     expected, expected_info = ROLLOUT(scene, params, PAIR_START, PUSH)
