@@ -1,6 +1,6 @@
 """Draws of blocks put together: one posterior of the whole scene."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -8,23 +8,15 @@ import numpy as np
 from boomdp_jax.core.arrays import Key, on_device
 from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.inference.block import Block
+from boomdp_jax.inference.evidence_report import BlockResult, report_evidence
 from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.one_step import NOISE_SHAPE
 from boomdp_jax.inference.posterior import Posterior
-from boomdp_jax.inference.sample import BlockDraws
 from boomdp_jax.physics.params import WORLD, Params, empty_params
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 NUM_PRIOR_DRAWS = 4096
 """Prior draws that a posterior carries, to judge what was identified."""
-
-
-class BlockResult(NamedTuple):
-    """A block and its place in a batch of draws."""
-
-    block: Block
-    draws: BlockDraws
-    place: int
 
 
 # Draws decoded by one call of the compiled program, whatever their number.
@@ -111,7 +103,8 @@ def assemble_posterior(
         inferred=inferred,
         spec=spec,
         log_evidence=sum((float(r.draws.log_evidence[r.place]) for r in results), 0.0),
-        diagnostics=_diagnostics(spec, results, notes, method),
+        diagnostics=_diagnostics(spec, results, notes, method)
+        | report_evidence(spec, results),
         seconds=seconds,
     )
 
@@ -234,7 +227,7 @@ def _diagnostics(
         "reasons": reasons,
         "notes": list(notes),
         "method": method,
-        "r_hat": max(r_hat, default=1.0),
-        "effective_sample_size": min(sizes, default=0.0),
+        "r_hat": max(r_hat, default=None),
+        "effective_sample_size": min(sizes, default=None),
         "jump_acceptance": min(jumps, default=None),
     }

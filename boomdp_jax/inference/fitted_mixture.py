@@ -14,7 +14,7 @@ from boomdp_jax.inference.find_modes import find_modes
 from boomdp_jax.inference.fit import FitSettings
 from boomdp_jax.inference.importance_evidence import ImportanceEvidence
 from boomdp_jax.inference.laplace_mixture import LaplaceMixture
-from boomdp_jax.inference.sample import start_mixtures
+from boomdp_jax.inference.structure_draws import start_mixtures
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.weighing import weigh_mixtures
 

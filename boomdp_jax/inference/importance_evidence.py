@@ -133,7 +133,7 @@ def draws_of_noise(
         mixture: where to draw from.
         even_share: as in `importance_draws`.
     """
-    mixture = _spread_evenly(target, mixture, even_share)
+    mixture = spread_evenly(target, mixture, even_share)
     num_draws = noise.choice.shape[0]
     position = (jnp.arange(num_draws) + offset) / num_draws
     cumulative = jnp.cumsum(jnp.exp(mixture.log_weight))
@@ -184,10 +184,16 @@ def weigh_draws(
     )
 
 
-def _spread_evenly(
+def spread_evenly(
     target: StructureTarget, mixture: LaplaceMixture, even_share: float
 ) -> LaplaceMixture:
-    """Raise improbable structures, keeping the proportions within each."""
+    """Raise improbable structures, keeping the proportions within each.
+
+    Args:
+        target: says which structures exist.
+        mixture: whose weights are changed.
+        even_share: share of the weight that all structures with components get alike.
+    """
     of_structure = mixture.structure_log_weight(target)
     num_present = jnp.sum(of_structure > -jnp.inf)
     within = mixture.log_weight - jnp.where(

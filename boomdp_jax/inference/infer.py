@@ -8,18 +8,21 @@ import jax
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.core.compile_time import CompileClock
 from boomdp_jax.core.history import History
-from boomdp_jax.inference.assemble import BlockResult, assemble_posterior
+from boomdp_jax.inference.assemble import assemble_posterior
 from boomdp_jax.inference.block import Block, make_block, stack_blocks
 from boomdp_jax.inference.compile_ahead import signature
 from boomdp_jax.inference.components import independent_blocks
+from boomdp_jax.inference.evidence_report import BlockResult
 from boomdp_jax.inference.fixed_structure import Structure
 from boomdp_jax.inference.nuts import run_nuts
 from boomdp_jax.inference.posterior import Posterior
-from boomdp_jax.inference.sample import SampleSettings, sample_blocks
+from boomdp_jax.inference.sample import sample_blocks
+from boomdp_jax.inference.structure_draws import SampleSettings
+from boomdp_jax.inference.svi import run_svi
 from boomdp_jax.physics.scene_spec import SceneSpec
 
-METHODS = ("auto", "rj", "nuts")
-"""Ways to infer: `auto` is `rj` until something better exists."""
+METHODS = ("auto", "rj", "enumerate", "smc", "nuts", "svi", "laplace", "map")
+"""Ways to infer: `auto` is `rj`."""
 
 
 def infer(
@@ -40,17 +43,23 @@ def infer(
         key: random key.
         spec: the scene: outlines, what is known, what may exist.
         history: recorded transitions. An empty one gives the prior.
-        method: `rj`, reversible jump over structures; `nuts`, a given structure by
-            the one-step likelihood, see `run_nuts`; or `auto`.
-        structure: for `nuts`: constraints that exist besides the known ones, such as
-            `{"table": ["revolute"]}`; default: the most probable ones.
+        method: how. Over structures and numbers: `rj`, reversible jumps; `enumerate`,
+            every structure weighed by importance sampling; `smc`, particles tempered
+            from the fitted mixture to the posterior; `laplace`, normal bumps on the
+            modes, quick and often wrong about odds, which it says; `map`, the single
+            best hypothesis. Numbers of one structure by the one-step likelihood:
+            `nuts`, see `run_nuts`, and `svi`, see `run_svi`. `auto` is `rj`.
+        structure: for `nuts` and `svi`: constraints that exist besides the known ones,
+            such as `{"table": ["revolute"]}`; default: the most probable ones.
         num_chains: chains, run side by side.
         num_warmup: iterations of each that adapt and are thrown away.
-        num_samples: iterations of each that are kept.
+        num_samples: iterations of each that are kept. `enumerate` and `laplace` give
+            as many draws, `smc` has as many particles.
         progress: show stages on standard error.
 
     Returns:
-        Draws of all chains, with diagnostics.
+        Draws of all chains, with diagnostics: not ok, with reasons, also where two
+        estimates of odds or evidence disagree beyond their stated errors.
 
     Raises:
         ValueError: an unknown method, a history of another number of bodies, a scene
@@ -110,22 +119,25 @@ def infer_batch(
         )
     for spec, history in zip(specs, histories, strict=True):
         _check(spec, history)
-    if method == "nuts":
+    if method in ("nuts", "svi"):
+        counts = {"num_samples": num_samples, "num_chains": num_chains}
+        if method == "nuts":
+            counts["num_warmup"] = num_warmup
+        run = {"nuts": run_nuts, "svi": run_svi}[method]
         return [
-            run_nuts(
+            run(
                 jax.random.fold_in(key, index),
                 spec,
                 history,
                 structure=structure,
-                num_warmup=num_warmup,
-                num_samples=num_samples,
-                num_chains=num_chains,
                 progress_bar=progress,
+                **counts,
             )
             for index, (spec, history) in enumerate(zip(specs, histories, strict=True))
         ]
     if structure is not None:
         raise ValueError(f"structure: expected none with method {method!r}")
+    method = "rj" if method == "auto" else method
     settings = SampleSettings(num_chains, num_warmup, num_samples)
     start = time.perf_counter()
     problems, notes = [], []
@@ -139,7 +151,9 @@ def infer_batch(
         for number, members in enumerate(groups):
             group_key = jax.random.fold_in(key, number)
             stacked = stack_blocks([block for _, block in members])
-            draws = sample_blocks(group_key, stacked, settings, bar.stage)
+            draws = sample_blocks(
+                group_key, stacked, settings, bar.stage, method=method
+            )
             for place, (index, block) in enumerate(members):
                 results[index].append(BlockResult(block, draws, place))
             bar.advance(len(members))
@@ -152,7 +166,7 @@ def infer_batch(
             results[index],
             seconds=dict(seconds),
             notes=notes[index],
-            method="rj" if method == "auto" else method,
+            method=method,
         )
         for index, spec in enumerate(specs)
     ]

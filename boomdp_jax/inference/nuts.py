@@ -1,34 +1,17 @@
 """A posterior by NUTS: the numbers of a scene in which a structure holds."""
 
-import dataclasses
-import time
+import functools
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.core.history import History
-from boomdp_jax.inference.assemble import BlockResult, assemble_posterior
-from boomdp_jax.inference.block import Block, make_block
-from boomdp_jax.inference.components import independent_blocks
-from boomdp_jax.inference.fitted_mixture import fitted_mixture
-from boomdp_jax.inference.fixed_structure import (
-    Structure,
-    scene_layout,
-    structure_blocks,
-    structure_of_slots,
-)
-from boomdp_jax.inference.numpyro_model import model_of_blocks
-from boomdp_jax.inference.nuts_chains import NutsDraws, sample_model
+from boomdp_jax.inference.fixed_structure import Structure
+from boomdp_jax.inference.nuts_chains import sample_model
+from boomdp_jax.inference.one_structure import infer_numbers
 from boomdp_jax.inference.posterior import Posterior
-from boomdp_jax.inference.sample import BlockDraws
-from boomdp_jax.physics.params import WORLD
 from boomdp_jax.physics.scene_spec import SceneSpec
-
-# Probability below which the chosen structure does not stand for the posterior.
-_SURE = 0.95
 
 
 def run_nuts(
@@ -74,144 +57,18 @@ def run_nuts(
     for name, count in (counts | {"num_chains": num_chains}).items():
         if count < 1:
             raise ValueError(f"{name}: expected at least 1, got {count}")
-    if history.num_bodies != spec.num_bodies:
-        raise ValueError(
-            f"{spec.source}: history: expected {spec.num_bodies} bodies, got "
-            f"{history.num_bodies}"
-        )
-    start = time.perf_counter()
-    choice_key, run_key, assemble_key = jax.random.split(key, 3)
-    with _Stages(progress_bar) as stages:
-        notes: list[str] = []
-        doubts: list[str] = []
-        if structure is None and scene_layout(spec).slots:
-            stages.show("choosing a structure")
-            structure, notes, doubts = _most_probable(choice_key, spec, history)
-        blocks = structure_blocks(spec, history, structure)
-        drawn = []
-        for number, block in enumerate(blocks):
-            names = tuple(spec.names[i] for i in block.bodies)
-            draws = sample_model(
-                jax.random.fold_in(run_key, number),
-                model_of_blocks([_renumbered(block)], _generic_names(block)),
-                num_chains=num_chains,
-                num_warmup=num_warmup,
-                num_samples=num_samples,
-                report=lambda stage, names=names: stages.show(
-                    f"{'+'.join(names)}: {stage}"
-                ),
-            )
-            drawn.append(draws)
-    posterior = assemble_posterior(
-        assemble_key,
+    sampler = functools.partial(
+        sample_model,
+        num_chains=num_chains,
+        num_warmup=num_warmup,
+        num_samples=num_samples,
+    )
+    return infer_numbers(
+        key,
         spec,
-        [
-            BlockResult(block, _block_draws(spec, block, draws), 0)
-            for block, draws in zip(blocks, drawn, strict=True)
-        ],
-        seconds={"compile": None, "run": time.perf_counter() - start},
-        notes=notes,
+        history,
+        sampler,
         method="nuts",
+        structure=structure,
+        progress_bar=progress_bar,
     )
-    diagnostics = dict(posterior.diagnostics)
-    diagnostics["reasons"] = [*diagnostics["reasons"], *doubts]
-    diagnostics["ok"] = not diagnostics["reasons"]
-    diagnostics["divergences"] = sum(draws.num_divergent for draws in drawn)
-    return dataclasses.replace(posterior, diagnostics=diagnostics)
-
-
-def _most_probable(
-    key: Key, spec: SceneSpec, history: History
-) -> tuple[dict[str, list], list[str], list[str]]:
-    """The most probable structure of every block, notes, and reasons for doubt."""
-    blocks, notes = independent_blocks(spec, history)
-    notes = list(notes)
-    structure: dict[str, list] = {}
-    doubts = []
-    for number, bodies in enumerate(blocks):
-        block = make_block(spec, bodies, history)
-        fitted = fitted_mixture(jax.random.fold_in(key, number), block.target)
-        evidence = fitted.evidence
-        best = int(jnp.argmax(evidence.probability))
-        probability = float(evidence.probability[best])
-        active = np.asarray(block.target.structures[best])
-        slots = [
-            slot._replace(
-                body_a=bodies[slot.body_a],
-                body_b=WORLD if slot.body_b == WORLD else bodies[slot.body_b],
-            )
-            for slot, is_active in zip(block.layout.slots, active, strict=True)
-            if is_active
-        ]
-        found = structure_of_slots(spec, slots)
-        for name, entries in found.items():
-            structure.setdefault(name, []).extend(entries)
-        names = "+".join(spec.names[i] for i in bodies)
-        text = f"{names}: structure {found}, of probability {probability:.2f}"
-        notes.append(f"{text}, chosen for NUTS")
-        if not probability >= _SURE:
-            doubts.append(f"{text}: NUTS leaves the others out; use method rj")
-    return structure, notes, doubts
-
-
-def _generic_names(block: Block) -> tuple[str, ...]:
-    return tuple(f"body_{i}" for i in range(len(block.bodies)))
-
-
-def _renumbered(block: Block) -> Block:
-    """The block by itself, so that equal blocks share a compiled program."""
-    return block._replace(bodies=tuple(range(len(block.bodies))))
-
-
-def _block_draws(spec: SceneSpec, block: Block, draws: NutsDraws) -> BlockDraws:
-    """Draws in the form of all samplers, chains one after the other."""
-    num_chains, num_samples = draws.log_density.shape
-    num_draws = num_chains * num_samples
-
-    def flat(leaf):
-        return np.asarray(leaf).reshape(1, num_draws, *leaf.shape[2:])
-
-    verdict = draws.diagnostics
-    named = [_named(spec, block, reason) for reason in verdict.reasons]
-    return BlockDraws(
-        structure=np.zeros((1, num_draws), np.int32),
-        z=flat(draws.z),
-        log_density=flat(draws.log_density),
-        noise_scale=flat(draws.noise_scale),
-        log_evidence=np.full(1, np.nan),
-        importance_probability=jnp.ones((1, 1)),
-        importance_size=jnp.full(1, jnp.nan),
-        diagnostics=[verdict._replace(reasons=named)],
-        chain_index=np.arange(num_chains),
-    )
-
-
-def _named(spec: SceneSpec, block: Block, text: str) -> str:
-    """Put the bodies' names back."""
-    for generic, body in zip(_generic_names(block), block.bodies, strict=True):
-        text = text.replace(f"{generic}.", f"{spec.names[body]}.")
-        text = text.replace(f"_to_{generic}", f"_to_{spec.names[body]}")
-    return text
-
-
-class _Stages:
-    """Stages on standard error; nothing unless asked for."""
-
-    def __init__(self, is_shown: bool):
-        self._bar = None
-        if is_shown:
-            from tqdm import tqdm
-
-            self._bar = tqdm(desc="nuts", bar_format="{desc} {elapsed} {postfix}")
-
-    def show(self, stage: str) -> None:
-        """Say what is being done."""
-        if self._bar is not None:
-            self._bar.set_postfix_str(stage)
-
-    def __enter__(self) -> "_Stages":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.close()

@@ -41,6 +41,7 @@ from boomdp_jax.inference.one_step import (
     OneStepLikelihood,
     draw_noise,
 )
+from boomdp_jax.inference.one_structure import ModelDraws
 from boomdp_jax.inference.prior import NOISE_GROUPS
 
 # Iterations of one compiled call; what is left over at the end is thrown away.
@@ -55,18 +56,7 @@ _MAX_DIVERGENT = 0.01
 _MAX_R_HAT, _MIN_SAMPLE_SIZE = 1.05, 100.0
 
 
-class NutsDraws(NamedTuple):
-    """Draws of one block, leading axes chain and draw."""
-
-    z: Float[Array, "chain draw dim"]
-    noise_scale: Float[Array, "chain draw body 4"]
-    log_density: Float[Array, "chain draw"]
-    """Of coordinates and log noise scales, as NUTS sees them."""
-    diagnostics: ChainDiagnostics
-    num_divergent: int
-
-
-class _Start(NamedTuple):
+class Start(NamedTuple):
     """Unconstrained points to start from, and the covariance to move with."""
 
     point: dict[str, Array]
@@ -81,7 +71,7 @@ def sample_model(
     num_warmup: int = 300,
     num_samples: int = 500,
     report: Callable[[str], None] = lambda stage: None,
-) -> NutsDraws:
+) -> ModelDraws:
     """Draw from the posterior of a model of one block.
 
     Args:
@@ -98,7 +88,7 @@ def sample_model(
     """
     fit_key, start_key, *run_keys = jax.random.split(key, 4)
     report("fitting")
-    start = _fitted_start(fit_key, start_key, model, num_chains)
+    start = fitted_start(fit_key, start_key, model, num_chains)
     half = max(num_warmup // 2, 1)
     report("warming up")
     keys = [jax.random.split(run_key, num_chains) for run_key in run_keys]
@@ -110,7 +100,7 @@ def sample_model(
     num = flat.shape[0] * flat.shape[1]
     covariance = scatter + _LAPLACE_DRAWS * start.covariance
     covariance = covariance / (num + _LAPLACE_DRAWS)
-    states = _begin(model, keys[1], _Start(states.z, covariance), half)
+    states = _begin(model, keys[1], Start(states.z, covariance), half)
     states, _ = _iterate(model, states, covariance, half, half)
     report("sampling")
     _, drawn = _iterate(model, states, covariance, half, num_samples)
@@ -126,7 +116,7 @@ class _Drawn(NamedTuple):
     num_steps: Array
 
 
-def _site_order(model: ObjectModel) -> tuple[str, ...]:
+def site_order(model: ObjectModel) -> tuple[str, ...]:
     """Names of sites in the order in which a flat vector holds their numbers."""
     noise = tuple(f"noise.{group}" for group in NOISE_GROUPS)
     return (*(site.name for site in model.sites[0]), *noise)
@@ -134,15 +124,15 @@ def _site_order(model: ObjectModel) -> tuple[str, ...]:
 
 def _flatten(model: ObjectModel, point: dict[str, Array]) -> Array:
     """All numbers of points `[chain, draw, ...]` along the last axis."""
-    parts = [point[name] for name in _site_order(model)]
+    parts = [point[name] for name in site_order(model)]
     return jnp.concatenate([p.reshape(*p.shape[:2], -1) for p in parts], axis=-1)
 
 
-def _hmc(model: ObjectModel, start: _Start, num_warmup: int, key: Key) -> tuple:
+def _hmc(model: ObjectModel, start: Start, num_warmup: int, key: Key) -> tuple:
     """A NUTS state at a start, and the function that makes one iteration."""
     potential = functools.partial(potential_energy, model, (), {})
     init, sample = hmc(potential_fn=potential, algo="NUTS")
-    order = _site_order(model)
+    order = site_order(model)
     state = init(
         start.point,
         num_warmup,
@@ -155,12 +145,12 @@ def _hmc(model: ObjectModel, start: _Start, num_warmup: int, key: Key) -> tuple:
 
 
 @eqx.filter_jit
-def _begin(model: ObjectModel, keys: Array, start: _Start, num_warmup: int) -> Any:
+def _begin(model: ObjectModel, keys: Array, start: Start, num_warmup: int) -> Any:
     """States of all chains; the start's points have a leading chain axis."""
 
     def one(inputs: tuple) -> Any:
         key, point = inputs
-        return _hmc(model, _Start(point, start.covariance), num_warmup, key)[0]
+        return _hmc(model, Start(point, start.covariance), num_warmup, key)[0]
 
     return jax.lax.map(one, (keys, start.point))
 
@@ -173,7 +163,7 @@ def _advance(
 
     def chain(state: Any) -> tuple[Any, _Drawn]:
         # NumPyro's iteration is set up by making a start; the compiler drops it.
-        start = _Start(state.z, covariance)
+        start = Start(state.z, covariance)
         _, sample = _hmc(model, start, num_warmup, state.rng_key)
 
         def iterate(state: Any, _: None) -> tuple[Any, _Drawn]:
@@ -199,10 +189,21 @@ def _iterate(
     return states, jax.tree.map(lambda leaf: leaf[:, -num:], drawn)
 
 
-def _fitted_start(
+def fitted_start(
     fit_key: Key, start_key: Key, model: ObjectModel, num_chains: int
-) -> _Start:
-    """Draws from the fitted modes' mixture, and the heaviest mode's covariance."""
+) -> Start:
+    """Draws from the fitted modes' mixture, and the heaviest mode's covariance.
+
+    Args:
+        fit_key: random key, for the fits.
+        start_key: random key, for the draws.
+        model: of one block, with a noise scale per group.
+        num_chains: draws.
+
+    Returns:
+        Unconstrained numbers by site with a leading chain axis; the covariance has
+        them in the order of `site_order`.
+    """
     (block,) = model.blocks
     targets = stack_blocks([block])
     modes = find_single_step_modes(fit_key, targets, FitSettings())
@@ -211,7 +212,7 @@ def _fitted_start(
 
 
 @eqx.filter_jit
-def _start_at(key: Key, model: ObjectModel, modes: Any, num_chains: int) -> _Start:
+def _start_at(key: Key, model: ObjectModel, modes: Any, num_chains: int) -> Start:
     target = model.blocks[0].target
     tracked: Any = target.log_likelihood
     likelihood = OneStepLikelihood(tracked.coordinates, tracked.data.steps)
@@ -238,7 +239,7 @@ def _start_at(key: Key, model: ObjectModel, modes: Any, num_chains: int) -> _Sta
     # The logarithm of a scale whose inverse square follows a gamma distribution.
     spread = 0.25 / (NOISE_SHAPE + 0.5 * count.T.ravel())
     covariance = jax.scipy.linalg.block_diag(rows @ rows.T, jnp.diag(spread))
-    return _Start(points, covariance)
+    return Start(points, covariance)
 
 
 def _unconstrained(site: Site, z: Float[Array, " dim"]) -> Array:
@@ -247,27 +248,32 @@ def _unconstrained(site: Site, z: Float[Array, " dim"]) -> Array:
     return site.loc + site.scale * part
 
 
-def _collect(model: ObjectModel, drawn: _Drawn) -> NutsDraws:
-    """Coordinates, noise scales and verdict from unconstrained draws."""
+def coordinates_of(model: ObjectModel, point: dict[str, Array]) -> Array:
+    """Coordinates `[chain, draw, dim]` of unconstrained numbers by site."""
     (block,) = model.blocks
-    shape = drawn.potential_energy.shape
+    shape = next(iter(point.values())).shape[:2]
     z = jnp.zeros((*shape, block.layout.dim))
     for site in model.sites[0]:
 
         def standard(value: Array, site: Site = site) -> Array:
             return jnp.ravel((value - site.loc) / site.scale)
 
-        value = jax.vmap(jax.vmap(standard))(drawn.z[site.name])
+        value = jax.vmap(jax.vmap(standard))(point[site.name])
         z = z.at[..., jnp.asarray(site.coordinates)].set(value)
-    z = jax.vmap(jax.vmap(block.target.wrap))(z)
+    return jax.vmap(jax.vmap(block.target.wrap))(z)
+
+
+def _collect(model: ObjectModel, drawn: _Drawn) -> ModelDraws:
+    """Coordinates, noise scales and verdict from unconstrained draws."""
     noise = [jnp.exp(drawn.z[f"noise.{group}"]) for group in NOISE_GROUPS]
     num_divergent = int(jnp.sum(drawn.diverging))
-    return NutsDraws(
-        z=z,
+    return ModelDraws(
+        z=coordinates_of(model, drawn.z),
         noise_scale=jnp.stack(noise, axis=-1),
         log_density=-drawn.potential_energy,
         diagnostics=_diagnose(model, drawn, num_divergent),
-        num_divergent=num_divergent,
+        log_evidence=float("nan"),
+        extras={"divergences": num_divergent},
     )
 
 

@@ -1,5 +1,6 @@
 """What is known after the data: weighted draws of Φ and noise, with names and scene."""
 
+import dataclasses
 import importlib
 import importlib.metadata
 import os
@@ -279,6 +280,23 @@ class Posterior(eqx.Module):
             "versions": dict(self.versions),
         }
         write_posterior_file(path, arrays, self.params, self.prior_params, header)
+
+
+def with_diagnostics(
+    posterior: Posterior, reasons: Iterable[str], extras: dict | None = None
+) -> Posterior:
+    """Add reasons for doubt, and further entries, to the diagnostics.
+
+    Args:
+        posterior: draws.
+        reasons: with any, the diagnostics are not ok.
+        extras: further entries.
+    """
+    diagnostics = dict(posterior.diagnostics)
+    diagnostics["reasons"] = [*diagnostics["reasons"], *reasons]
+    diagnostics["ok"] = not diagnostics["reasons"]
+    diagnostics |= extras or {}
+    return dataclasses.replace(posterior, diagnostics=diagnostics)
 
 
 _ARRAYS = (

@@ -1,64 +1,47 @@
-"""From targets to draws: fit, propose from the fitted mixture, jump, check."""
+"""From targets to draws: fit, draw by one of several methods, check."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from boomdp_jax.core.arrays import Key, on_device
-from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics, diagnose_chains
 from boomdp_jax.inference.compile_ahead import CompileAhead, signature
+from boomdp_jax.inference.enumerate_structures import enumerate_structures
 from boomdp_jax.inference.evaluate import evaluate_points
 from boomdp_jax.inference.find_modes import Found, find_modes
-from boomdp_jax.inference.fit import FitSettings, Modes
+from boomdp_jax.inference.fit import Modes
 from boomdp_jax.inference.fit_noise import NoiseFit, filter_points
-from boomdp_jax.inference.laplace_mixture import LaplaceMixture
-from boomdp_jax.inference.mixture_building import (
-    add_prior_components,
-    add_slot_components,
-    add_spare_components,
-    laplace_mixture,
-)
+from boomdp_jax.inference.laplace_draws import best_hypothesis, sample_laplace
 from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.one_step import NOISE_SHAPE
-from boomdp_jax.inference.population import (
-    MoveCounts,
-    Population,
-    PopulationSettings,
-    sample_population,
-)
+from boomdp_jax.inference.population import Population, sample_population
 from boomdp_jax.inference.structure_chain import ChainDraws
+from boomdp_jax.inference.structure_draws import (
+    SampleSettings,
+    StructureDraws,
+    pick_object,
+    start_mixtures,
+)
+from boomdp_jax.inference.structure_evidence import (
+    StructureEvidence,
+    VisitedShares,
+    evidence_by_importance,
+    odds_disagree,
+    visited_shares,
+)
 from boomdp_jax.inference.target import StructureTarget
+from boomdp_jax.inference.tempered_smc import sample_tempered
+from boomdp_jax.inference.walker_moves import MoveCounts
+from boomdp_jax.inference.weighing import evaluate_each
 
 # Chains go on where an R-hat of any object exceeds this.
 _R_HAT = 1.015
-
-
-class SampleSettings(NamedTuple):
-    """How much to draw."""
-
-    num_chains: int = 4
-    num_warmup: int = 200
-    num_samples: int = 500
-    num_importance: int = 2048
-    num_walkers: int = 64
-    """Of each chain, at most as many as draws."""
-    fit: FitSettings = FitSettings()
-
-    @property
-    def population(self) -> PopulationSettings:
-        """The same in sweeps of all walkers; at least as many draws as asked for."""
-        num_walkers = min(self.num_walkers, self.num_samples)
-        return PopulationSettings(
-            num_chains=self.num_chains,
-            num_walkers=num_walkers,
-            num_warmup=-(-self.num_warmup // num_walkers),
-            num_sweeps=-(-self.num_samples // num_walkers),
-            num_importance=max(self.num_importance, self.num_chains * num_walkers),
-        )
+# Importance sampling is heard only with as many effective draws.
+_MIN_SAMPLE_SIZE = 100.0
 
 
 class BlockDraws(NamedTuple):
@@ -75,27 +58,11 @@ class BlockDraws(NamedTuple):
     """`[object, draw, body, 4]`."""
     log_evidence: np.ndarray
     """`[object]`."""
-    importance_probability: Float[Array, "object structure"]
-    """Structure probabilities by importance sampling, a cross-check."""
-    importance_size: Float[Array, " object"]
+    evidence: StructureEvidence | None
+    """Of every structure; None where the method gives none."""
     diagnostics: list[ChainDiagnostics]
     chain_index: np.ndarray
     """Index of each chain; draws lie chain after chain."""
-
-
-@QuickCompile
-def start_mixtures(targets: StructureTarget, modes: Modes) -> LaplaceMixture:
-    """Proposal mixtures: fitted modes, modes times priors, and the prior."""
-
-    def one(target, modes):
-        mixture = laplace_mixture(
-            target, modes.structure, modes.z, modes.precision, modes.log_density
-        )
-        mixture = add_slot_components(target, mixture, total_weight=0.4)
-        mixture = add_prior_components(target, mixture, total_weight=0.02)
-        return add_spare_components(target, mixture)
-
-    return jax.vmap(one)(targets, modes)
 
 
 def sample_blocks(
@@ -103,6 +70,8 @@ def sample_blocks(
     targets: StructureTarget,
     settings: SampleSettings,
     report: Callable[[str], None] = lambda stage: None,
+    *,
+    method: str = "rj",
 ) -> BlockDraws:
     """Posterior draws over structures and coordinates of a batch of equal blocks.
 
@@ -111,45 +80,112 @@ def sample_blocks(
         targets: with a `FilteredLikelihood`, stacked along a leading object axis.
         settings: how much to draw.
         report: called with the name of each stage as it begins.
+        method: one of `SAMPLERS`.
 
     Returns:
         Draws of all chains one after the other, noise drawn given each.
     """
-    fit_key, chain_key, noise_key = jax.random.split(key, 3)
+    fit_key, draw_key, noise_key = jax.random.split(key, 3)
+    draw = SAMPLERS[method]
     ahead = CompileAhead(
-        lambda: _rehearse(chain_key, targets, settings), (signature(targets), settings)
+        lambda: _rehearse(draw_key, targets, settings, draw),
+        (signature(targets), settings, method),
     )
     with ahead:
         found: Found = find_modes(fit_key, targets, settings.fit, report)
     targets = found.targets
-    report("jumping between structures")
-    mixtures = start_mixtures(targets, found.modes)
-    population = sample_population(
-        chain_key,
-        targets,
-        mixtures,
-        settings.population,
-        is_mixed=lambda draws: _is_mixed(targets, draws),
-    )
-    draws, evidence = population.draws, population.evidence
-    num_objects = targets.structures.shape[0]
-    structure = np.asarray(draws.structure).reshape(num_objects, -1)
-    z = np.asarray(draws.z).reshape(*structure.shape, -1)
-    log_joint = np.asarray(evidence.log_evidence, float) + np.asarray(targets.log_prior)
+    report(_STAGES[method])
+    drawn = draw(draw_key, targets, found.modes, settings, evaluate_each)
+    num_objects, num_chains = drawn.structure.shape[:2]
+    structure = drawn.structure.reshape(num_objects, -1)
+    z = drawn.z.reshape(*structure.shape, -1)
     return BlockDraws(
         structure=structure,
         z=z,
-        log_density=np.asarray(draws.log_density).reshape(structure.shape),
+        log_density=drawn.log_density.reshape(structure.shape),
         noise_scale=_noise(noise_key, targets, structure, z),
-        log_evidence=np.logaddexp.reduce(log_joint, axis=-1),
-        importance_probability=evidence.probability,
-        importance_size=evidence.effective_sample_size,
-        diagnostics=[_diagnose(targets, population, i) for i in range(num_objects)],
-        chain_index=np.arange(settings.num_chains),
+        log_evidence=drawn.evidence.total,
+        evidence=drawn.evidence,
+        diagnostics=drawn.diagnostics,
+        chain_index=np.arange(num_chains),
     )
 
 
-def _rehearse(key: Key, targets: StructureTarget, settings: SampleSettings) -> None:
+def sample_by_jumps(
+    key: Key,
+    targets: StructureTarget,
+    modes: Modes,
+    settings: SampleSettings,
+    evaluate: Callable[..., Array] = evaluate_each,
+) -> StructureDraws:
+    """Draw by reversible jumps of a population of walkers; see `population`.
+
+    Args:
+        key: random key.
+        targets: stacked along a leading object axis.
+        modes: fitted modes of every structure.
+        settings: how much to draw.
+        evaluate: from targets, structures `[object, point]` and coordinates `[object,
+            point, dim]` to log-densities `[object, point]`.
+
+    Returns:
+        Draws of all chains; evidence by importance sampling, whose odds the visits of
+        the chains must agree with.
+    """
+    population = sample_population(
+        key,
+        targets,
+        start_mixtures(targets, modes),
+        settings.population,
+        evaluate=evaluate,
+        is_mixed=lambda draws: _is_mixed(targets, draws),
+    )
+    draws = population.draws
+    evidence = evidence_by_importance(
+        population.evidence, np.asarray(targets.log_prior, float)
+    )
+    structure = np.asarray(draws.structure)
+    shares = visited_shares(
+        structure,
+        targets.structures.shape[1],
+        settings.num_chains * settings.population.num_walkers,
+    )
+    return StructureDraws(
+        structure=structure,
+        z=np.asarray(draws.z),
+        log_density=np.asarray(draws.log_density),
+        evidence=evidence,
+        diagnostics=[
+            _diagnose(targets, population, evidence, shares, index)
+            for index in range(len(structure))
+        ],
+    )
+
+
+SAMPLERS: dict[str, Callable[..., StructureDraws]] = {
+    "rj": sample_by_jumps,
+    "enumerate": enumerate_structures,
+    "smc": sample_tempered,
+    "laplace": sample_laplace,
+    "map": best_hypothesis,
+}
+"""Samplers over structures by method."""
+
+_STAGES = {
+    "rj": "jumping between structures",
+    "enumerate": "weighing structures",
+    "smc": "tempering",
+    "laplace": "drawing from the modes",
+    "map": "choosing the best mode",
+}
+
+
+def _rehearse(
+    key: Key,
+    targets: StructureTarget,
+    settings: SampleSettings,
+    draw: Callable[..., StructureDraws],
+) -> None:
     """Go through all stages but the likelihood of many points, to compile them."""
     num_objects, num_structures = targets.structures.shape[:2]
     likelihood: Any = targets.log_likelihood
@@ -169,39 +205,45 @@ def _rehearse(key: Key, targets: StructureTarget, settings: SampleSettings) -> N
         precision=on_device(precision, dtype),
         log_density=on_device(np.zeros((num_objects, num_modes)), dtype),
     )
-    sample_population(
+    draw(
         key,
         targets,
-        start_mixtures(targets, modes),
-        settings.population._replace(num_warmup=1, num_sweeps=1),
-        evaluate=lambda targets, structure, z: on_device(
-            np.zeros(structure.shape), dtype
-        ),
+        modes,
+        # One sweep of warm-up and one that counts.
+        settings._replace(num_warmup=1, num_samples=settings.population.num_walkers)
+        if draw is sample_by_jumps
+        else settings,
+        lambda targets, structure, z: -0.5 * (z**2).sum(axis=-1),
     )
 
 
 def _is_mixed(targets: StructureTarget, draws: ChainDraws) -> bool:
     """Whether the chains of every object agree."""
     for index in range(targets.structures.shape[0]):
-        verdict = diagnose_chains(*_pick((targets, draws), index))
+        verdict = diagnose_chains(*pick_object((targets, draws), index))
         if max(verdict.r_hat.values(), default=1.0) > _R_HAT:
             return False
     return True
 
 
-def _pick(tree, index: int):
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[index], tree)
-
-
 def _diagnose(
-    targets: StructureTarget, population: Population, index: int
+    targets: StructureTarget,
+    population: Population,
+    evidence: StructureEvidence,
+    shares: VisitedShares,
+    index: int,
 ) -> ChainDiagnostics:
     """Judge one object."""
     counts = population.counts
-    return diagnose_chains(
-        *_pick((targets, population.draws), index),
+    verdict = diagnose_chains(
+        *pick_object((targets, population.draws), index),
         MoveCounts(counts.proposed[index][None], counts.accepted[index][None]),
     )
+    reasons = list(verdict.reasons)
+    if float(population.evidence.effective_sample_size[index]) >= _MIN_SAMPLE_SIZE:
+        names = ("the chains' visits", "importance sampling")
+        reasons += odds_disagree(shares, evidence, index, names)
+    return verdict._replace(ok=not reasons, reasons=reasons)
 
 
 def _noise(key: Key, targets: StructureTarget, structure, z) -> np.ndarray:

@@ -45,9 +45,9 @@ def weigh_twice(
     evaluate: Callable[..., Array],
 ) -> tuple[LaplaceMixture, ImportanceEvidence]:
     """The same with another source of randomness and of log-densities."""
-    evidence = _weigh(rng, targets, mixtures, num_draws, evaluate)
-    mixtures = _refine(targets, mixtures, evidence)
-    return mixtures, _weigh(rng, targets, mixtures, num_draws, evaluate)
+    evidence = weigh(rng, targets, mixtures, num_draws, evaluate)
+    mixtures = refine(targets, mixtures, evidence)
+    return mixtures, weigh(rng, targets, mixtures, num_draws, evaluate)
 
 
 @QuickCompile
@@ -60,14 +60,22 @@ def _weigh_all(targets: StructureTarget, draws, log_density):
     return jax.vmap(weigh_draws)(targets, draws, log_density)
 
 
-def _weigh(
+def weigh(
     rng: np.random.Generator,
     targets: StructureTarget,
     mixtures: LaplaceMixture,
     num_draws: int,
     evaluate: Callable[..., Array],
 ) -> ImportanceEvidence:
-    """Draw from mixtures and weigh the draws."""
+    """Draw from mixtures and weigh the draws.
+
+    Args:
+        rng: source of randomness.
+        targets: stacked along a leading object axis.
+        mixtures: one of each object.
+        num_draws: of each object.
+        evaluate: log-densities of as many points of every object.
+    """
     num_objects = targets.structures.shape[0]
     noise = batch_noise(rng, targets, mixtures, num_draws)
     offset = on_device(rng.random(num_objects), noise.normal.dtype)
@@ -104,7 +112,14 @@ def evaluate_each(
 
 
 @QuickCompile
-def _refine(targets: StructureTarget, mixtures: LaplaceMixture, evidence):
+def _refine_all(targets: StructureTarget, mixtures: LaplaceMixture, evidence):
     return jax.vmap(
         lambda t, m, e: refine_weights(t, m, e.structure, e.z, e.log_weight)
     )(targets, mixtures, evidence)
+
+
+def refine(
+    targets: StructureTarget, mixtures: LaplaceMixture, evidence: ImportanceEvidence
+) -> LaplaceMixture:
+    """Set the weights of components to their shares of weighted draws."""
+    return _refine_all(targets, mixtures, evidence)

@@ -1,0 +1,114 @@
+"""Objects drawn from the prior, and readings of them drawn from the model itself."""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from boomdp_jax.core.history import make_history
+from boomdp_jax.inference.block import make_block, stack_blocks
+from boomdp_jax.inference.target import StructureTarget
+from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
+from boomdp_jax.physics.state import state_from_array
+from boomdp_jax.physics.step import step
+
+DT = 0.05
+# Spread of the states that steps start from [m, rad, m/s, rad/s], and of the wrenches
+# per mass of a body of median density [N/kg, N m/kg].
+_STATE = np.array([0.3, 0.3, 1.0, 0.5, 0.5, 1.0])
+_WRENCH = np.array([8.0, 8.0, 2.0])
+
+
+class PriorObjects(NamedTuple):
+    """True hypotheses with the targets that their readings make."""
+
+    targets: StructureTarget
+    """Stacked along a leading object axis, with the one-step likelihood."""
+    structure: np.ndarray
+    """`[object]`."""
+    z: np.ndarray
+    """`[object, dim]`."""
+
+
+def box_scene() -> SceneSpec:
+    """A box on a floor, that may have a wheel and may rub."""
+    return scene_spec_from_dict(
+        {
+            "schema": "planar-scene-1",
+            "gravity": [0.0, 0.0],
+            "dt": DT,
+            "bodies": [
+                {"name": "box", "shape": {"type": "box", "half_extents": [0.3, 0.2]}}
+            ],
+            # The prior of a pin's place depends on where the body was seen, which is
+            # data: for an exact test only constraints whose prior does not.
+            "unknown": {"wheel": 1, "ground": 1},
+        },
+        source="calibration",
+    )
+
+
+def draw_objects(
+    rng: np.random.Generator, num_objects: int, num_rows: int
+) -> PriorObjects:
+    """Draw hypotheses from the prior, and readings of single steps given each.
+
+    Every step starts at a state of its own that is known exactly, as the one-step
+    likelihood has it; what it ends at is read with noise whose scales follow their
+    prior.
+    """
+    spec = box_scene()
+    state = rng.normal(size=(num_objects, num_rows, 1, 6)) * _STATE
+    mass = 30.0 * float(spec.scene.area[0])
+    wrench = rng.normal(size=(num_objects, num_rows, 1, 3)) * _WRENCH * mass
+    episode = np.arange(num_rows)
+
+    def stacked(next_state: np.ndarray) -> StructureTarget:
+        blocks = [
+            make_block(spec, (0,), make_history(s, a, n, DT, episode=episode))
+            for s, a, n in zip(state, wrench, next_state, strict=True)
+        ]
+        return stack_blocks(blocks)
+
+    # Of targets only what does not depend on readings is used here.
+    targets = stacked(state)
+    probability = np.exp(np.asarray(targets.log_prior[0], float))
+    structure = rng.choice(
+        len(probability), size=num_objects, p=probability / probability.sum()
+    )
+    period = np.asarray(targets.period[0], float)
+    turn = period * (rng.random((num_objects, len(period))) - 0.5)
+    z = np.where(period > 0, turn, rng.standard_normal(turn.shape))
+    slots = np.asarray(targets.structures[0])
+    active = np.concatenate([slots, np.ones((len(slots), 1), bool)], axis=1)
+    z = np.where(active[:, np.asarray(targets.slot[0])][structure], z, 0.0)
+    truth = _predict(targets, structure, z, state, wrench)
+    likelihood: Any = targets.log_likelihood
+    scale = np.asarray(likelihood.coordinates.scales.noise, float)[0]
+    variance = scale**2 / rng.gamma(1.0, size=(num_objects, 4))
+    sd = np.sqrt(variance)[:, None, None, [0, 0, 1, 2, 2, 3]]
+    noise = sd * rng.standard_normal(truth.shape)
+    return PriorObjects(stacked(truth + noise), structure, z)
+
+
+@jax.jit
+def _step_all(coordinates, z, active, state, wrench):
+    def one_object(coordinates, z, active, states, wrenches):
+        params = coordinates(z, active)
+
+        def one_step(state, wrench):
+            return step(coordinates.scene, params, state_from_array(state), wrench)[0]
+
+        return jax.vmap(lambda s, w: one_step(s, w).array)(states, wrenches)
+
+    return jax.vmap(one_object)(coordinates, z, active, state, wrench)
+
+
+def _predict(targets, structure, z, state, wrench) -> np.ndarray:
+    """Where every step ends, without noise."""
+    likelihood: Any = targets.log_likelihood
+    dtype = targets.log_prior.dtype
+    active = np.asarray(targets.structures[0])[structure]
+    arrays = (np.asarray(x, dtype) for x in (state, wrench))
+    found = _step_all(likelihood.coordinates, np.asarray(z, dtype), active, *arrays)
+    return np.asarray(found, float)

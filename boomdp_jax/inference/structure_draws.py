@@ -1,0 +1,79 @@
+"""What every sampler over structures is asked for, and what it gives."""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from boomdp_jax.core.quick_compile import QuickCompile
+from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics
+from boomdp_jax.inference.fit import FitSettings, Modes
+from boomdp_jax.inference.laplace_mixture import LaplaceMixture
+from boomdp_jax.inference.mixture_building import (
+    add_prior_components,
+    add_slot_components,
+    add_spare_components,
+    laplace_mixture,
+)
+from boomdp_jax.inference.population import PopulationSettings
+from boomdp_jax.inference.structure_evidence import StructureEvidence
+from boomdp_jax.inference.target import StructureTarget
+
+
+class SampleSettings(NamedTuple):
+    """How much to draw."""
+
+    num_chains: int = 4
+    num_warmup: int = 200
+    num_samples: int = 500
+    """Draws of each chain."""
+    num_importance: int = 2048
+    num_walkers: int = 64
+    """Of each chain, at most as many as draws."""
+    fit: FitSettings = FitSettings()
+
+    @property
+    def population(self) -> PopulationSettings:
+        """The same in sweeps of all walkers; at least as many draws as asked for."""
+        num_walkers = min(self.num_walkers, self.num_samples)
+        return PopulationSettings(
+            num_chains=self.num_chains,
+            num_walkers=num_walkers,
+            num_warmup=-(-self.num_warmup // num_walkers),
+            num_sweeps=-(-self.num_samples // num_walkers),
+            num_importance=max(self.num_importance, self.num_chains * num_walkers),
+        )
+
+
+class StructureDraws(NamedTuple):
+    """Draws of a batch of objects, all of equal weight; on the host."""
+
+    structure: np.ndarray
+    """`[object, chain, draw]`."""
+    z: np.ndarray
+    """`[object, chain, draw, dim]`."""
+    log_density: np.ndarray
+    """`[object, chain, draw]`."""
+    evidence: StructureEvidence
+    diagnostics: list[ChainDiagnostics]
+    """One of each object."""
+
+
+@QuickCompile
+def start_mixtures(targets: StructureTarget, modes: Modes) -> LaplaceMixture:
+    """Proposal mixtures: fitted modes, modes times priors, and the prior."""
+
+    def one(target, modes):
+        mixture = laplace_mixture(
+            target, modes.structure, modes.z, modes.precision, modes.log_density
+        )
+        mixture = add_slot_components(target, mixture, total_weight=0.4)
+        mixture = add_prior_components(target, mixture, total_weight=0.02)
+        return add_spare_components(target, mixture)
+
+    return jax.vmap(one)(targets, modes)
+
+
+def pick_object(tree, index: int):
+    """One object of a batch, on the host."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[index], tree)
