@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import NoReturn, TextIO
 
-METHODS = ("auto", "rj", "nuts")
+METHODS = ("auto", "rj", "enumerate", "smc", "nuts", "svi", "laplace", "map")
 """Ways to infer that exist."""
 
 

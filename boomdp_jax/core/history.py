@@ -59,6 +59,47 @@ class History(eqx.Module):
         """All rows, masked ones included."""
         return Transition(self.state, self.action, self.next_state, self.dt)
 
+    def padded(self, capacity: int) -> "History":
+        """The same table with room for more rows, on the host.
+
+        Args:
+            capacity: rows to make room for.
+
+        Returns:
+            The history, itself if it has that capacity.
+
+        Raises:
+            ValueError: fewer than it has.
+        """
+        more = capacity - self.capacity
+        if more < 0:
+            raise ValueError(
+                f"capacity: expected at least {self.capacity} rows, got {capacity}"
+            )
+        if more == 0:
+            return self
+
+        def pad(leaf: Array, axis: int, fill: float | int = 0) -> Array:
+            width = [(0, 0)] * leaf.ndim
+            width[axis] = (0, more)
+            array = np.asarray(leaf)
+            return on_device(np.pad(array, width, constant_values=fill), array.dtype)
+
+        first = np.asarray(self.dt).reshape(-1)[:1]
+
+        return History(
+            state=pad(self.state, -3),
+            action=pad(self.action, -3),
+            next_state=pad(self.next_state, -3),
+            # A step of no length would be another length.
+            dt=pad(self.dt, -1, float(first[0]) if first.size else 1.0),
+            episode=pad(self.episode, -1, -1),
+            mask=pad(self.mask, -1),
+            state_mask=pad(self.state_mask, -3),
+            next_state_mask=pad(self.next_state_mask, -3),
+            is_chained=pad(self.is_chained, -1),
+        )
+
 
 def make_history(
     state: np.ndarray | Array,

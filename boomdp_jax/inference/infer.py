@@ -92,6 +92,9 @@ def infer_batch(
 ) -> list[Posterior]:
     """The same for many scenes; equal blocks of bodies share one compiled call.
 
+    Histories of different lengths are padded to the longest, so that they share it
+    too; one of less than a quarter of that length, to a quarter, and so on.
+
     Args:
         key: random key.
         specs: the scenes.
@@ -140,6 +143,7 @@ def infer_batch(
     method = "rj" if method == "auto" else method
     settings = SampleSettings(num_chains, num_warmup, num_samples)
     start = time.perf_counter()
+    histories = padded_histories(histories)
     problems, notes = [], []
     for index, (spec, history) in enumerate(zip(specs, histories, strict=True)):
         blocks, screened = independent_blocks(spec, history)
@@ -184,6 +188,18 @@ def _check(spec: SceneSpec, history: History) -> None:
                 f"{spec.source}: body {body.name!r}: center_of_mass: expected a known "
                 "one; inferring it is not supported yet"
             )
+
+
+def padded_histories(histories: Sequence[History]) -> list[History]:
+    """Histories with few different capacities, none of over four times its own."""
+    longest = max((history.capacity for history in histories), default=0)
+    out = []
+    for history in histories:
+        capacity = longest
+        while capacity > 4 and -(-capacity // 4) >= history.capacity:
+            capacity = -(-capacity // 4)
+        out.append(history.padded(capacity))
+    return out
 
 
 def _group(problems: list[tuple[int, Block]]) -> list[list[tuple[int, Block]]]:

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from boomdp_jax.cli.main import main
+import boomdp_jax.inference
+from boomdp_jax.cli.main import METHODS, main
 from boomdp_jax.cli.output import numbered, without_non_finite
 
 SCENE = """{"schema": "planar-scene-1", "gravity": [0, 0], "dt": 0.02,
@@ -106,6 +107,10 @@ def test_an_unknown_method_names_those_that_exist(
     assert main("infer data.npz --scene scene.json --method mcmc".split()) == 2
     line = capsys.readouterr().err
     assert all(name in line for name in ("'mcmc'", "auto", "rj", "enumerate"))
+
+
+def test_methods_are_those_of_the_library():
+    assert METHODS == boomdp_jax.inference.METHODS
 
 
 def test_help_is_status_0(capsys: pytest.CaptureFixture):

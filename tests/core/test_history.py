@@ -25,6 +25,18 @@ def test_padding_is_masked_and_harmless():
     assert bool(np.all(history.dt > 0))
 
 
+def test_padding_later_is_padding_at_once():
+    later = make_history(**_rows()).padded(8)
+    for name, expected in vars(make_history(**_rows(), capacity=8)).items():
+        np.testing.assert_array_equal(getattr(later, name), expected, err_msg=name)
+    assert later.padded(8) is later
+
+
+def test_padding_to_fewer_rows_is_refused():
+    with pytest.raises(ValueError, match="capacity: expected at least 5 rows, got 4"):
+        make_history(**_rows()).padded(4)
+
+
 def test_a_missing_reading_is_masked_and_zero():
     rows = _rows()
     rows["state"][2, 0, 4] = np.nan
