@@ -46,7 +46,9 @@ class ObjectModel(eqx.Module):
 
     Sample sites, by body and constraint: `table.density` [kg/m²];
     `table.revolute.anchor_a`, `anchor_b` [m], `viscous_rate` [1/s], `dry_share`;
-    `table.distance.length` [m]; `table.wheel.position` [m], `heading` [rad] (to be read
+    `table.distance.length` [m]; `table.prismatic.axis` [rad] (modulo half a turn),
+    `offset` [m] (of the line from where the body was seen), `angle` [rad],
+    `viscous_rate`, `dry_share`; `table.weld.offset` [m], `angle` [rad]; `table.wheel.position` [m], `heading` [rad] (to be read
     modulo half a turn), `lateral_rate` [1/s], `lateral_limit`, `viscous_ratio`,
     `dry_ratio`, `half_track` [m]; `table.ground.dry`, `knee_speed` [m/s],
     `torque_share`, `load_shift` [m]. A joint between two bodies is

@@ -252,9 +252,9 @@ def test_a_scene_file_keeps_them(tmp_path):
         ({"lower": 1.0, "upper": 0.0}, "upper: expected a number of at least 1"),
         ({"motor_speed": 1.0}, "motor_force"),
         ({"motor_speed": 1.0, "motor_force": -1.0}, "motor_force: expected"),
-        ({"axis": None}, "axis: expected"),
+        ({"axis": "up"}, "axis: expected"),
         ({"angle": "flat"}, "angle: expected"),
-        ({"anchor_a": None}, "anchor_a: expected"),
+        ({"anchor_a": "hinge"}, "anchor_a: expected"),
     ],
 )
 def test_what_is_wrong_is_named(change, message):
