@@ -4,9 +4,9 @@ Every number of Φ is a smooth function of coordinates that are standard normal 
 (a direction: uniform over half a turn), so that the prior density of Φ is the
 push-forward of that simple one. Drawers and welds have as many coordinates as there are
 different ones: a drawer a direction, a distance across it and an angle, a weld a pose,
-from where the body was seen (`resting`). Coefficients are sampled relative to mass and weight:
-what a motion tells of them does not depend on the mass, and where only gravity acts the
-mass drops out exactly.
+from where the body was seen (`resting`). Coefficients are sampled relative to mass and
+weight: what a motion tells of them does not depend on the mass, and where only gravity
+acts the mass drops out exactly.
 """
 
 from typing import NamedTuple

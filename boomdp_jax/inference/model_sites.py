@@ -26,8 +26,10 @@ Link = Literal["identity", "log", "logit", "half_turn"]
 
 
 class Site(NamedTuple):
-    """One sample site; its `coordinates` are (link(value) - loc) / scale, a direction's
-    brought to half a turn about zero."""
+    """One sample site; its `coordinates` are (link(value) - loc) / scale.
+
+    A direction's is brought to half a turn about zero.
+    """
 
     name: str
     coordinates: tuple[int, ...]

@@ -33,9 +33,9 @@ DEFAULT_SCALES: dict[str, Scale] = {
     "distance.length": Scale(1.0, 1.0),
     # Of a drawer: its friction along the line, viscous over mass [1/s] and dry as a
     # share of the weight, log-normal; how far the line passes from the mean of the
-    # observed positions, in units of body radius, and how far the angle is from the mean
-    # of the observed ones [rad], normal. Narrow, because the likelihood takes where a
-    # run starts as given, and a drawer has that line and that angle from there.
+    # observed positions, in units of body radius, and how far the angle is from the
+    # mean of the observed ones [rad], normal. Narrow, because the likelihood takes
+    # where a run starts as given, and a drawer has that line and that angle from there.
     "prismatic.viscous_rate": Scale(0.1, 2.0),
     "prismatic.dry_share": Scale(0.03, 2.0),
     "prismatic.offset": Scale(0.0, 0.1),

@@ -4,7 +4,8 @@ Both hold a body's angle, a drawer keeps its centre of mass on a line, a weld at
 point. With the mean pose $(x_0, \theta_0)$ that was seen and the direction $\phi_0$ in
 which positions spread most (all against the partner), n across the axis,
 
-- drawer: axis $\phi_0 + z_0$, line through $x_0 + n\,s\,z_1$, angle $\theta_0 + s' z_2$;
+- drawer: axis $\phi_0 + z_0$, line through $x_0 + n s z_1$, angle
+  $\theta_0 + s' z_2$;
 - weld: place $x_0 + s\,(z_0, z_1)$, angle $\theta_0 + s' z_2$.
 
 The axis's range is cut across $\phi_0$, where no drawer that has moved lies: on the cut

@@ -3,8 +3,8 @@
 Two draws have the same structure where the same kinds of constraint act on the same
 bodies. Slots are interchangeable, a joint's ends may be swapped, a drawer's axis may be
 turned by pi, and a wheel's heading too, or by pi/2 with its two coefficients swapped;
-all of these are undone here before anything is averaged. Only constraints whose existence is inferred
-count; known ones are part of the scene.
+all of these are undone here before anything is averaged. Only constraints whose
+existence is inferred count; known ones are part of the scene.
 """
 
 import itertools
@@ -19,7 +19,7 @@ from boomdp_jax.inference.summary import (
     axial_mean,
     summarise,
 )
-from boomdp_jax.physics.constraint_spec import JOINTS, KINDS
+from boomdp_jax.physics.constraint_spec import JOINTS
 from boomdp_jax.physics.params import WORLD, Params
 
 SCALES: dict[str, Scale | tuple[Scale, ...]] = {

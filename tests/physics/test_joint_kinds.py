@@ -264,8 +264,8 @@ def test_what_is_wrong_is_named(change, message):
 
 
 def test_inference_refuses_what_it_does_not_know():
-    spec = drawer()
+    spec = drawer(lower=-1.0, upper=1.0)
     states = np.zeros((3, 1, 6))
     history = make_history(states, np.zeros((3, 1, 3)), states, dt=0.02)
-    with pytest.raises(ValueError, match="got prismatic"):
+    with pytest.raises(ValueError, match="got prismatic with a limit"):
         infer(jax.random.key(0), spec, history)
