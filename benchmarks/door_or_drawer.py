@@ -13,6 +13,7 @@ what is fixed, by the longer side; mass, by the true one (that of a fixed thing 
 be told).
 """
 
+import sys
 import time
 
 import jax
@@ -49,10 +50,11 @@ def main() -> None:
             progress=True,
         )
         seconds.append(time.perf_counter() - start)
-        results += [
-            score(thing, posterior)
-            for (thing, _), posterior in zip(chosen, posteriors, strict=True)
-        ]
+        for place, ((thing, _), posterior) in enumerate(
+            zip(chosen, posteriors, strict=True)
+        ):
+            results.append(score(thing, posterior))
+            note_failure(begin + place, results[-1])
     results = results[:num]
     report_all(reporter, results)
     # The first call compiles.
@@ -103,7 +105,15 @@ def score(thing: JointObject, posterior) -> dict:
         "probability": probability[kind],
         "errors": errors,
         "is_ok": posterior.diagnostics["ok"],
+        "reasons": posterior.diagnostics["reasons"],
     }
+
+
+def note_failure(number: int, result: dict) -> None:
+    """Say on standard error which object is wrong, and how."""
+    worst = max(result["errors"].values(), default=np.inf)
+    if not result["is_right"] or worst >= TARGET_ERROR or not result["is_ok"]:
+        print(f"object {number}: {result}", file=sys.stderr, flush=True)
 
 
 def errors_of(thing: JointObject, draws, weight: np.ndarray) -> dict[str, float]:
