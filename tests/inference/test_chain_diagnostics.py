@@ -17,7 +17,7 @@ def test_an_angle_close_to_zero_is_judged_beyond_single_precision():
         structures=jnp.ones((1, 0), bool),
         log_prior=jnp.zeros(1),
         slot=jnp.full(1, -1, jnp.int32),
-        period=jnp.full(1, np.pi),
+        period=jnp.full(1, np.pi, jnp.float32),
     )
     draws = ChainDraws(
         jnp.zeros((4, 256), jnp.int32),
