@@ -12,6 +12,7 @@ from boomdp_jax.inference.evidence_report import BlockResult, report_evidence
 from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.one_step import NOISE_SHAPE
 from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.physics.constraint_spec import JOINTS, KINDS
 from boomdp_jax.physics.params import WORLD, Params, empty_params
 from boomdp_jax.physics.scene_spec import SceneSpec
 
@@ -123,8 +124,7 @@ def _merge(
     """Params of the scene from those of its blocks, and which slots are inferred."""
     num_draws = parts[0].density.shape[0] if parts else 1
     num_joints = {
-        kind: sum(block.layout.count(kind) for block in blocks)
-        for kind in ("revolute", "distance")
+        kind: sum(block.layout.count(kind) for block in blocks) for kind in JOINTS
     }
     num_each = {
         kind: max((block.layout.count(kind) for block in blocks), default=0)
@@ -136,6 +136,8 @@ def _merge(
         num_distance=num_joints["distance"],
         num_wheel=num_each["wheel"],
         num_ground=num_each["ground"],
+        num_prismatic=num_joints["prismatic"],
+        num_weld=num_joints["weld"],
     )
     arrays = jax.tree.map(
         lambda leaf: np.broadcast_to(np.asarray(leaf), (num_draws, *leaf.shape)).copy(),
@@ -144,7 +146,8 @@ def _merge(
     fields: dict[str, dict[str, np.ndarray]] = {
         # Ranges and motors, which inference does not know, are None.
         kind: {k: v for k, v in vars(getattr(arrays, kind)).items() if v is not None}
-        for kind in ("revolute", "distance", "wheel", "ground")
+        for kind in KINDS
+        if getattr(arrays, kind) is not None
     }
     shape = (num_draws, spec.num_bodies)
     fields["wheel"]["half_track"] = np.zeros((*shape, num_each["wheel"]))
@@ -154,13 +157,16 @@ def _merge(
         kind: np.zeros(fields[kind]["active"].shape[1:], bool) for kind in fields
     }
     density = np.array(arrays.density)
-    first = {"revolute": 0, "distance": 0}
+    first = {kind: 0 for kind in JOINTS if kind in fields}
     for block, part in zip(blocks, parts, strict=True):
         index = np.asarray(block.bodies)
         density[:, index] = np.asarray(part.density)
         to_scene = np.append(index, WORLD)
         for kind in fields:
-            block_fields = vars(getattr(part, kind))
+            group = getattr(part, kind)
+            if group is None:
+                continue
+            block_fields = vars(group)
             count = block.layout.count(kind)
             for name, values in block_fields.items():
                 if name not in fields[kind]:
@@ -194,10 +200,7 @@ def _merge(
 
     params = Params(
         density=on_device(density, dtype),
-        revolute=build("revolute"),
-        distance=build("distance"),
-        wheel=build("wheel"),
-        ground=build("ground"),
+        **{kind: build(kind) for kind in fields},
     )
     return params, inferred
 

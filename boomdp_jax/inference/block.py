@@ -51,11 +51,11 @@ def make_block(spec: SceneSpec, bodies: tuple[int, ...], history: History) -> Bl
     rows, log_prior = structures(
         layout, spec.unknown, options, is_loaded=spec.normal_gravity > 0
     )
-    positions = _positions(history, bodies)
+    poses = _poses(history, bodies)
     coordinates = Coordinates(
         layout=layout,
         scales=prior_scales(options),
-        surroundings=surroundings(spec, bodies, layout, positions),
+        surroundings=surroundings(spec, bodies, layout, poses),
         scene=_block_scene(spec.scene, bodies),
     )
     dt = np.asarray(history.dt)[np.asarray(history.mask)]
@@ -84,16 +84,16 @@ def make_block(spec: SceneSpec, bodies: tuple[int, ...], history: History) -> Bl
     return Block(bodies, layout, target)
 
 
-def _positions(history: History, bodies: tuple[int, ...]) -> np.ndarray:
-    """All positions that were read, NaN where missing, `[reading, body, 2]`."""
+def _poses(history: History, bodies: tuple[int, ...]) -> np.ndarray:
+    """All poses that were read, NaN where missing, `[reading, body, 3]`."""
     out = []
     for values, seen in (
         (history.state, history.state_mask),
         (history.next_state, history.next_state_mask),
     ):
         values, seen = (
-            np.asarray(values)[:, bodies, :2],
-            np.asarray(seen)[:, bodies, :2],
+            np.asarray(values)[:, bodies, :3],
+            np.asarray(seen)[:, bodies, :3],
         )
         out.append(
             np.where(seen & np.asarray(history.mask)[:, None, None], values, np.nan)

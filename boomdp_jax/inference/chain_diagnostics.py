@@ -99,7 +99,8 @@ def _within_structure(
 ) -> dict[str, np.ndarray]:
     """Coordinates of the commonest structure, chains cut to equal length.
 
-    Angles enter by sine and cosine, which do not jump where an angle is wrapped.
+    Angles enter by sine and cosine, which do not jump where an angle is wrapped; in
+    double precision, or the cosine of one close to zero would be all rounding.
     """
     commonest = int(np.argmax(np.bincount(structure.ravel())))
     num_each = np.sum(structure == commonest, axis=1)
@@ -115,7 +116,7 @@ def _within_structure(
     slot, active = np.asarray(target.slot), np.asarray(target.structures)[commonest]
     is_used = np.append(active, True)[slot]
     for index in np.flatnonzero(is_used):
-        value = kept[..., index]
+        value = kept[..., index].astype(np.float64)
         if period[index] > 0:
             turn = 2.0 * np.pi * value / period[index]
             series[f"z_{index}_cos"] = np.cos(turn)

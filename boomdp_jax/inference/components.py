@@ -18,9 +18,10 @@ def independent_blocks(
     """Split the movable bodies of a scene into blocks that do not interact.
 
     Known constraints tie bodies for certain. A pair that may be tied by an unknown pin
-    is tested by the least-squares misfit of the best common anchors; one that may be
-    tied by an unknown rod, by how much the distance of its centres varies beyond what
-    the outlines' radii allow.
+    (or a weld, which is a pin as well) is tested by the least-squares misfit of the
+    best common anchors; one that may be tied by an unknown rod, by how much the
+    distance of its centres varies beyond what the outlines' radii allow; by an unknown
+    drawer, by how far the one leaves a line fixed in the other, or its angle.
 
     Args:
         spec: the scene.
@@ -43,8 +44,9 @@ def independent_blocks(
         if a in parent and b in parent:
             parent[root(a)] = root(b)
     dropped = []
-    can_pin, can_rod = spec.unknown.get("revolute", 0), spec.unknown.get("distance", 0)
-    if (can_pin or can_rod) and len(movable) > 1:
+    can_pin = spec.unknown.get("revolute", 0) or spec.unknown.get("weld", 0)
+    can_rod, can_slide = (spec.unknown.get(k, 0) for k in ("distance", "prismatic"))
+    if (can_pin or can_rod or can_slide) and len(movable) > 1:
         rows = np.asarray(history.mask)
         state = np.asarray(history.state, float)[rows]
         seen = np.asarray(history.state_mask)[rows]
@@ -54,6 +56,10 @@ def independent_blocks(
             is_tied = bool(can_pin) and misfit < TIE_TOLERANCE
             if can_rod and not is_tied:
                 is_tied = _may_be_rod(spec, state[use], a, b)
+            if can_slide and not is_tied:
+                reach = spec.bodies[a].reach
+                miss = _slide_misfit(state[use, a], state[use, b], reach)
+                is_tied = miss < TIE_TOLERANCE
             if is_tied:
                 parent[root(a)] = root(b)
             else:
@@ -74,6 +80,20 @@ def _pin_misfit(a: np.ndarray, b: np.ndarray) -> float:
     offset = (a[:, :2] - b[:, :2]).reshape(-1)
     solution = np.linalg.lstsq(matrix, -offset, rcond=1e-6)[0]
     return float(np.sqrt(np.mean((matrix @ solution + offset) ** 2)))
+
+
+def _slide_misfit(a: np.ndarray, b: np.ndarray, reach: float) -> float:
+    """Root mean square miss of the best line fixed in b and angle [m].
+
+    An angle counts by how far it moves the outline, which reaches so far.
+    """
+    if len(a) == 0:
+        return 0.0
+    place = np.einsum("tji,tj->ti", _rotations(b[:, 2]), a[:, :2] - b[:, :2])
+    across = np.linalg.eigvalsh(np.cov(place.T, bias=True))[0]
+    angle = a[:, 2] - b[:, 2]
+    turn = np.abs(np.mean(np.exp(1j * angle)))
+    return float(np.sqrt(max(across, 0.0) + reach**2 * 2.0 * (1.0 - turn)))
 
 
 def _rotations(angle: np.ndarray) -> np.ndarray:

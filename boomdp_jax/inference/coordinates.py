@@ -1,10 +1,12 @@
 r"""From standard-normal coordinates to Φ: the prior as a map.
 
-Every number of Φ is a smooth function of one coordinate that is standard normal a
-priori (a heading: uniform over half a turn), so that the prior density of Φ is the
-push-forward of that simple one. Coefficients are sampled relative to mass and weight:
-what a motion tells of them does not depend on the mass, and where only gravity acts the
-mass drops out exactly.
+Every number of Φ is a smooth function of coordinates that are standard normal a priori
+(a direction: uniform over half a turn), so that the prior density of Φ is the
+push-forward of that simple one. Drawers and welds have as many coordinates as there are
+different ones: a drawer a direction, a distance across it and an angle, a weld a pose,
+from where the body was seen (`resting`). Coefficients are sampled relative to mass and
+weight: what a motion tells of them does not depend on the mass, and where only gravity
+acts the mass drops out exactly.
 """
 
 from typing import NamedTuple
@@ -18,12 +20,15 @@ from jaxtyping import Array, Bool, Float
 from boomdp_jax.core.arrays import on_device
 from boomdp_jax.inference.layout import Layout, SlotKey
 from boomdp_jax.inference.prior import PriorScales
+from boomdp_jax.inference.resting import rest_numbers, rest_pose
 from boomdp_jax.physics.params import (
     WORLD,
     Distance,
     Ground,
     Params,
+    Prismatic,
     Revolute,
+    Weld,
     Wheel,
 )
 from boomdp_jax.physics.scene import Scene
@@ -46,6 +51,8 @@ class Surroundings(eqx.Module):
     """Mean of the observed positions [m]."""
     spread: Float[Array, " body"]
     """How far from it the positions lie [m]."""
+    rest: Float[Array, "rest 4"]
+    """Pose of `Layout.rests` and the way they moved most; see `rest_pose`."""
     density: Float[Array, " body"]
     """Known density, NaN where it is to be inferred [kg/m²]."""
     known: dict[int, dict[str, Float[Array, "..."]]]
@@ -53,7 +60,7 @@ class Surroundings(eqx.Module):
 
 
 def surroundings(
-    spec: SceneSpec, bodies: tuple[int, ...], layout: Layout, positions: np.ndarray
+    spec: SceneSpec, bodies: tuple[int, ...], layout: Layout, poses: np.ndarray
 ) -> Surroundings:
     """Measure what the prior needs to know of a block.
 
@@ -61,12 +68,13 @@ def surroundings(
         spec: the scene.
         bodies: indices of the block's bodies in the scene.
         layout: its slots.
-        positions: observed positions `[reading, body, 2]` [m]; NaN where missing.
+        poses: observed poses `[reading, body, 3]` [m, m, rad]; NaN where missing.
 
     Returns:
         The sizes, on the default float type.
     """
     lows, highs, radii, centers, spreads = [], [], [], [], []
+    positions = poses[..., :2]
     for i, index in enumerate(bodies):
         body = spec.bodies[index]
         corners = body.vertices if body.radius == 0 else None
@@ -90,12 +98,16 @@ def surroundings(
         }
         for slot in layout.known_slots
     }
+    authored = (spec.bodies[i].pose for i in bodies)
+    start = np.array([np.zeros(3) if pose is None else pose for pose in authored])
+    rest = [rest_pose(slot, poses, start) for slot in layout.rests]
     return Surroundings(
         radius=on_device(radii),
         half_extents=on_device((highs - lows) / 2),
         box_center=on_device((highs + lows) / 2),
         center=on_device(np.stack(centers)),
         spread=on_device(spreads),
+        rest=on_device(np.reshape(rest, (-1, 4))),
         density=on_device(
             [
                 np.nan if spec.bodies[i].density is None else spec.bodies[i].density
@@ -115,6 +127,16 @@ _JOINT_SHAPES: dict[str, dict[str, tuple[int, ...]]] = {
         "dry": (),
     },
     "distance": {"active": (), "anchor_a": (2,), "anchor_b": (2,), "length": ()},
+    "prismatic": {
+        "active": (),
+        "anchor_a": (2,),
+        "anchor_b": (2,),
+        "axis": (),
+        "angle": (),
+        "viscous": (),
+        "dry": (),
+    },
+    "weld": {"active": (), "anchor_a": (2,), "anchor_b": (2,), "angle": ()},
 }
 _BODY_SHAPES: dict[str, dict[str, tuple[int, ...]]] = {
     "wheel": {
@@ -194,12 +216,17 @@ class Coordinates(eqx.Module):
             for key, value in around.known[slot.known].items():
                 numbers[key] = jnp.where(jnp.isnan(value), numbers[key], value)
             made[_place(slot)] = numbers
+        has = {slot.kind for slot in self.layout.rests}
         return Params(
             density=density,
             revolute=Revolute(**self._joint_arrays("revolute", made)),
             distance=Distance(**self._joint_arrays("distance", made)),
             wheel=Wheel(**self._body_arrays("wheel", made)),
             ground=Ground(**self._body_arrays("ground", made)),
+            prismatic=Prismatic(**self._joint_arrays("prismatic", made))
+            if "prismatic" in has
+            else None,
+            weld=Weld(**self._joint_arrays("weld", made)) if "weld" in has else None,
         )
 
     def _scaled(self, name: str, z):
@@ -227,6 +254,17 @@ class Coordinates(eqx.Module):
             numbers["length"] = body.reach * jnp.exp(
                 self._scaled("distance.length", z[4])
             )
+        elif slot in self.layout.rests:
+            rest = around.rest[self.layout.rests.index(slot)]
+            known = around.known.get(slot.known, {})
+            numbers |= rest_numbers(
+                slot.kind, z, rest, around.radius[a], self.scales, known
+            )
+        if slot.kind == "prismatic":
+            rate = jnp.exp(self._scaled("prismatic.viscous_rate", z[3]))
+            share = jnp.exp(self._scaled("prismatic.dry_share", z[4]))
+            numbers["viscous"] = body.mass * rate
+            numbers["dry"] = body.mass * body.weight * share
         elif slot.kind == "wheel":
             numbers["position"] = around.box_center[a] + around.half_extents[
                 a

@@ -12,7 +12,7 @@ from boomdp_jax.inference.target import StructureTarget
 
 
 class Guesses(NamedTuple):
-    """Where pins and axles would have to be, on the host; see `seeds`."""
+    """Where constraints would have to be, on the host; see `seeds`."""
 
     z: np.ndarray
     """`[object, dim]`."""

@@ -13,7 +13,8 @@ from boomdp_jax.core.history import History
 from boomdp_jax.inference.block import Block, make_block
 from boomdp_jax.inference.components import independent_blocks
 from boomdp_jax.inference.layout import Layout, SlotKey, block_layout
-from boomdp_jax.physics.constraint_spec import KINDS, ConstraintSpec
+from boomdp_jax.inference.redundancy import NEW_KINDS, Tie, is_redundant
+from boomdp_jax.physics.constraint_spec import JOINTS, KINDS, ConstraintSpec
 from boomdp_jax.physics.params import WORLD
 from boomdp_jax.physics.scene_spec import SceneSpec
 
@@ -21,11 +22,19 @@ Structure = Mapping[str, Sequence[Any]]
 """Inferred constraints by body: `{"table": ["revolute", "wheel"]}`; a joint with
 another body is a pair, `{"cart": [("revolute", "pole")]}`."""
 
-_JOINTS = ("revolute", "distance")
 # Numbers of each kind, as a scene file with nulls would have them.
 _NUMBERS: dict[str, dict[str, tuple[int, ...]]] = {
     "revolute": {"anchor_a": (2,), "anchor_b": (2,), "viscous": (), "dry": ()},
     "distance": {"anchor_a": (2,), "anchor_b": (2,), "length": ()},
+    "prismatic": {
+        "anchor_a": (2,),
+        "anchor_b": (2,),
+        "axis": (),
+        "angle": (),
+        "viscous": (),
+        "dry": (),
+    },
+    "weld": {"anchor_a": (2,), "anchor_b": (2,), "angle": ()},
     "wheel": {"position": (2,), "heading": (), "viscous": (2,), "dry": (2,)},
     "ground": {"viscous": (), "dry": ()},
 }
@@ -76,8 +85,8 @@ def fix_structure(
         A scene with the constraints added to the known ones and nothing else unknown.
 
     Raises:
-        ValueError: a body, kind or partner that the scene does not have, or more
-            constraints of a kind than it allows.
+        ValueError: a body, kind or partner that the scene does not have, more
+            constraints of a kind than it allows, or some that fewer say as well.
     """
     if structure is None:
         structure = {}
@@ -89,6 +98,7 @@ def fix_structure(
         for item in _read_entries(spec, name, entries)
     ]
     _check_caps(spec, added)
+    _check_redundancy(spec, added)
     constraints = tuple(
         ConstraintSpec(
             kind,
@@ -156,6 +166,19 @@ def _as_inferred(block: Block, num_known: int) -> Block:
     return block._replace(layout=layout, target=target)
 
 
+def _check_redundancy(spec: SceneSpec, added: list[tuple[str, int, int]]) -> None:
+    """Refuse constraints that leave bodies no motion, but for a weld alone."""
+    known = [Tie(c.kind, c.body_a, c.body_b, False) for c in spec.constraints]
+    ties = known + [Tie(*each, True) for each in added]
+    has_new = any(tie.kind in NEW_KINDS for tie in ties)
+    if has_new and is_redundant(ties):
+        kinds = ", ".join(tie.kind for tie in ties)
+        raise ValueError(
+            f"{spec.source}: structure: expected constraints that say more than a weld "
+            f"between their bodies, or that weld alone; got {kinds}"
+        )
+
+
 def _from_mask(spec: SceneSpec, mask: np.ndarray) -> dict[str, list]:
     """Readable form of a choice of slots."""
     slots = scene_layout(spec).slots
@@ -211,8 +234,8 @@ def _read_entries(
         body_a, body_b = spec.index(name), WORLD
         if partner != "world":
             others = [other for other in movable if other != name]
-            if kind not in _JOINTS or partner not in others:
-                expected = "the world" if kind not in _JOINTS else ", ".join(others)
+            if kind not in JOINTS or partner not in others:
+                expected = "the world" if kind not in JOINTS else ", ".join(others)
                 raise ValueError(
                     f"{where}: {name}: {kind}: expected as partner {expected}; got "
                     f"{partner!r}"
@@ -243,7 +266,7 @@ def _check_caps(spec: SceneSpec, added: list[tuple[str, int, int]]) -> None:
     for (kind, body), count in used.items():
         cap = spec.unknown.get(kind, 0)
         reason = f"the scene's unknown.{kind}"
-        if kind not in _JOINTS and spec.normal_gravity <= 0:
+        if kind not in JOINTS and spec.normal_gravity <= 0:
             cap, reason = 0, "nothing presses bodies to the floor"
         if count > cap:
             raise ValueError(

@@ -7,15 +7,24 @@ from typing import NamedTuple
 import numpy as np
 
 from boomdp_jax.inference.prior import PriorOptions
-from boomdp_jax.physics.constraint_spec import KINDS
+from boomdp_jax.inference.redundancy import NEW_KINDS, Tie, is_redundant
+from boomdp_jax.physics.constraint_spec import JOINTS, KINDS
 from boomdp_jax.physics.params import WORLD
 from boomdp_jax.physics.scene_spec import SceneSpec
 
-NUM_COORDINATES = {"revolute": 6, "distance": 5, "wheel": 8, "ground": 5}
+NUM_COORDINATES = {
+    "revolute": 6,
+    "distance": 5,
+    "prismatic": 5,
+    "weld": 3,
+    "wheel": 8,
+    "ground": 5,
+}
 """Coordinates of one constraint of each kind; see `coordinates.py` for their order."""
 
-HEADING = 2
-"""Which coordinate of a wheel is its heading."""
+DIRECTION = {"wheel": 2, "prismatic": 0}
+"""Which coordinate of a kind is a direction, the same when turned by half a turn: a
+wheel's heading, a drawer's axis."""
 
 _MAX_STRUCTURES = 4096
 
@@ -27,7 +36,7 @@ class SlotKey(NamedTuple):
     body_a: int
     body_b: int
     index: int
-    """Joint slot for revolute and distance; slot of its body for wheel and ground."""
+    """Slot of the scene for joints; slot of its body for wheel and ground."""
     start: int
     """First coordinate."""
     known: int
@@ -60,12 +69,18 @@ class Layout(NamedTuple):
         return out
 
     def period(self) -> np.ndarray:
-        """Period of each coordinate, `[dim]`: pi for headings, else 0."""
+        """Period of each coordinate, `[dim]`: pi for directions, else 0."""
         out = np.zeros(self.dim)
         for slot in self.slots + self.known_slots:
-            if slot.kind == "wheel":
-                out[slot.start + HEADING] = math.pi
+            if slot.kind in DIRECTION:
+                out[slot.start + DIRECTION[slot.kind]] = math.pi
         return out
+
+    @property
+    def rests(self) -> tuple[SlotKey, ...]:
+        """Slots whose numbers are measured from where the bodies were seen."""
+        slots = sorted(self.slots + self.known_slots, key=lambda slot: slot.start)
+        return tuple(slot for slot in slots if slot.kind in NEW_KINDS)
 
 
 def block_layout(spec: SceneSpec, bodies: tuple[int, ...]) -> Layout:
@@ -81,10 +96,10 @@ def block_layout(spec: SceneSpec, bodies: tuple[int, ...]) -> Layout:
     Raises:
         ValueError: the scene has a joint that inference cannot take along.
     """
-    _refuse_other_kinds(spec)
+    _refuse_drives(spec)
     place = {body: i for i, body in enumerate(bodies)}
     start = len(bodies)
-    counts = {"revolute": 0, "distance": 0}
+    counts = dict.fromkeys(JOINTS, 0)
     per_body = {
         (kind, i): 0 for kind in ("wheel", "ground") for i in range(len(bodies))
     }
@@ -106,22 +121,22 @@ def block_layout(spec: SceneSpec, bodies: tuple[int, ...]) -> Layout:
             partner = place.get(constraint.body_b, WORLD)
             add(known, constraint.kind, place[constraint.body_a], partner, entry)
     movable = [i for i, body in enumerate(bodies) if not spec.is_static[body]]
-    for kind in ("revolute", "distance", "wheel", "ground"):
+    for kind in KINDS:
         for i in movable:
             for _ in range(spec.unknown.get(kind, 0)):
                 add(inferred, kind, i, WORLD, -1)
-    for kind in ("revolute", "distance"):
+    for kind in JOINTS:
         if spec.unknown.get(kind, 0):
             for i, j in itertools.combinations(movable, 2):
                 add(inferred, kind, i, j, -1)
     return Layout(len(bodies), tuple(inferred), tuple(known), start)
 
 
-def _refuse_other_kinds(spec: SceneSpec) -> None:
-    """Joints of which inference would otherwise take no notice."""
+def _refuse_drives(spec: SceneSpec) -> None:
+    """Ranges and motors, of which inference would otherwise take no notice."""
     for index, constraint in enumerate(spec.constraints):
         extras = sorted({"limit", "motor"} & constraint.numbers.keys())
-        if constraint.kind in KINDS and not extras:
+        if not extras:
             continue
         what = " with a ".join([constraint.kind, *extras])
         raise ValueError(
@@ -141,7 +156,8 @@ def structures(
 
     Each optional constraint is present independently, truncated to the caps. Of slots
     that could be exchanged only the canonical choice is listed: the first ones are in
-    use.
+    use. What fewer constraints say as well is left out, see `redundancy`: a weld to
+    the world stands alone, and pin and drawer exclude each other.
 
     Args:
         layout: slots of the block.
@@ -169,6 +185,7 @@ def structures(
         )
     needs_load = [slot.kind in ("wheel", "ground") for slot in layout.slots]
     needs_load = np.array(needs_load, bool)
+    known = [Tie(s.kind, s.body_a, s.body_b, False) for s in layout.known_slots]
     rows, weights = [], []
     for counts in itertools.product(*(range(size) for size in sizes)):
         used: dict[tuple, int] = {}
@@ -181,14 +198,22 @@ def structures(
             row[group[:count]] = True
             weight += math.log(math.comb(len(group), count))
             weight += _log_power(p, count) + _log_power(1 - p, len(group) - count)
-        if weight > -math.inf and all(
-            count <= caps.get(kind, 0) for (kind, _), count in used.items()
+        if (
+            weight > -math.inf
+            and all(count <= caps.get(kind, 0) for (kind, _), count in used.items())
+            and not (layout.rests and is_redundant(known + _ties(layout, row)))
         ):
             rows.append(row)
             is_possible = is_loaded or not row[needs_load].any()
             weights.append(weight if is_possible else -math.inf)
     log_prior = np.array(weights)
     return np.stack(rows), log_prior - np.logaddexp.reduce(log_prior)
+
+
+def _ties(layout: Layout, row: np.ndarray) -> list[Tie]:
+    """Constraints of active slots."""
+    active = (slot for slot, is_on in zip(layout.slots, row, strict=True) if is_on)
+    return [Tie(slot.kind, slot.body_a, slot.body_b, True) for slot in active]
 
 
 def _log_power(p: float, count: int) -> float:

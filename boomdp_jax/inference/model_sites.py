@@ -26,7 +26,10 @@ Link = Literal["identity", "log", "logit", "half_turn"]
 
 
 class Site(NamedTuple):
-    """One sample site; its `coordinates` are (link(value) - loc) / scale."""
+    """One sample site; its `coordinates` are (link(value) - loc) / scale.
+
+    A direction's is brought to half a turn about zero.
+    """
 
     name: str
     coordinates: tuple[int, ...]
@@ -55,7 +58,8 @@ class Site(NamedTuple):
         elif self.link == "logit":
             linked = logit(value)
         elif self.link == "half_turn":
-            linked = value - math.pi * jnp.floor(value / math.pi + 0.5)
+            turned = value - self.loc
+            linked = value - math.pi * jnp.floor(turned / math.pi + 0.5)
         return jnp.reshape((linked - self.loc) / self.scale, -1)
 
     def from_coordinates(self, z: Float[Array, " dim"]) -> Array:
@@ -104,6 +108,17 @@ _NUMBERS: dict[str, tuple[tuple[str, str, int, int], ...]] = {
         ("anchor_a", "distance.anchor", 0, 2),
         ("anchor_b", "distance.anchor", 2, 2),
         ("length", "distance.length", 4, 1),
+    ),
+    "prismatic": (
+        ("axis", "", 0, 1),
+        ("offset", "prismatic.offset", 1, 1),
+        ("angle", "prismatic.angle", 2, 1),
+        ("viscous_rate", "prismatic.viscous_rate", 3, 1),
+        ("dry_share", "prismatic.dry_share", 4, 1),
+    ),
+    "weld": (
+        ("offset", "weld.offset", 0, 2),
+        ("angle", "weld.angle", 2, 1),
     ),
     "wheel": (
         ("position", "wheel.position", 0, 2),
@@ -176,13 +191,13 @@ def _slot_sites(slot: SlotKey, name: str, coordinates: Any) -> list[Site]:
     sites = []
     for field, entry, first, count in _NUMBERS[slot.kind]:
         places = tuple(range(slot.start + first, slot.start + first + count))
-        if field == "heading":
-            zero, one = jnp.zeros(()), jnp.ones(())
-            sites.append(Site(f"{name}.{field}", places, "half_turn", zero, one))
+        if field in ("heading", "axis"):
+            loc, one = _direction(slot, coordinates), jnp.ones(())
+            sites.append(Site(f"{name}.{field}", places, "half_turn", loc, one))
             continue
         center = coordinates.scales.center[entry]
         spread = coordinates.scales.spread[entry]
-        origin, unit = _origin_and_unit(slot, field, coordinates.surroundings)
+        origin, unit = _origin_and_unit(slot, field, coordinates)
         if entry in LOGARITHMIC:
             link, loc, scale = "log", center + jnp.log(unit), spread
         elif entry in _LOGISTIC:
@@ -195,18 +210,29 @@ def _slot_sites(slot: SlotKey, name: str, coordinates: Any) -> list[Site]:
     return sites
 
 
-def _origin_and_unit(slot: SlotKey, field: str, around: Any) -> tuple[Array, Array]:
+def _direction(slot: SlotKey, coordinates: Any) -> Array:
+    """Where a direction is measured from [rad]."""
+    if slot.kind == "wheel":
+        return jnp.zeros(())
+    return coordinates.surroundings.rest[coordinates.layout.rests.index(slot), 3]
+
+
+def _origin_and_unit(
+    slot: SlotKey, field: str, coordinates: Any
+) -> tuple[Array, Array]:
     """Where a number is measured from, and in multiples of what."""
-    a, b = slot.body_a, slot.body_b
+    a, b, around = slot.body_a, slot.body_b, coordinates.surroundings
     reach = around.radius + around.spread
     zero, one = jnp.zeros(()), jnp.ones(())
     if field == "anchor_b":
         return (around.center[a], reach[a]) if b == WORLD else (zero, reach[b])
     if field in ("anchor_a", "length"):
         return zero, reach[a]
+    if field == "angle":
+        return around.rest[coordinates.layout.rests.index(slot), 2], one
     if field == "position":
         return around.box_center[a], around.half_extents[a]
-    if field in ("half_track", "load_shift"):
+    if field in ("half_track", "load_shift", "offset"):
         return zero, around.radius[a]
     return zero, one
 

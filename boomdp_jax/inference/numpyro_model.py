@@ -46,14 +46,16 @@ class ObjectModel(eqx.Module):
 
     Sample sites, by body and constraint: `table.density` [kg/m²];
     `table.revolute.anchor_a`, `anchor_b` [m], `viscous_rate` [1/s], `dry_share`;
-    `table.distance.length` [m]; `table.wheel.position` [m], `heading` [rad] (to be read
-    modulo half a turn), `lateral_rate` [1/s], `lateral_limit`, `viscous_ratio`,
-    `dry_ratio`, `half_track` [m]; `table.ground.dry`, `knee_speed` [m/s],
-    `torque_share`, `load_shift` [m]. A joint between two bodies is
-    `cart.revolute_to_pole`. Rates, shares, limits and ratios are relative to mass and
-    weight, as `prior.py` has them. Noise is `noise.position` [m], `noise.angle` [rad],
-    `noise.velocity` [m/s], `noise.spin` [rad/s], one number per body, or the single
-    `noise`.
+    `table.distance.length` [m]; `table.prismatic.axis` [rad] (to be read modulo half a
+    turn), `offset` of the line from where the body was seen [m], `angle` [rad],
+    `viscous_rate` [1/s], `dry_share`; `table.weld.offset` [m], `angle` [rad];
+    `table.wheel.position` [m], `heading` [rad] (to be read modulo half a turn),
+    `lateral_rate` [1/s], `lateral_limit`, `viscous_ratio`, `dry_ratio`, `half_track`
+    [m]; `table.ground.dry`, `knee_speed` [m/s], `torque_share`, `load_shift` [m]. A
+    joint between two bodies is `cart.revolute_to_pole`. Rates, shares, limits and
+    ratios are relative to mass and weight, as `prior.py` has them. Noise is
+    `noise.position` [m], `noise.angle` [rad], `noise.velocity` [m/s], `noise.spin`
+    [rad/s], one number per body, or the single `noise`.
 
     Deterministic sites: `table.mass` [kg] and the coefficients in SI units,
     `table.revolute.viscous`, `table.wheel.viscous`, `table.ground.viscous`, `...dry`.

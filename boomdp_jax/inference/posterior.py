@@ -89,8 +89,9 @@ class Posterior(eqx.Module):
     prior_noise_scale: Float[Array, "prior_draw body 4"]
     """Prior draws of `noise_scale`."""
     inferred: dict[str, np.ndarray] = eqx.field(static=True, converter=_record)
-    """Which slots are inferred rather than known: revolute and distance `[joint]`,
-    wheel `[body, wheel]`, ground `[body, ground]`."""
+    """Which slots are inferred rather than known: revolute, distance and, where the
+    params have them, prismatic and weld `[joint]`, wheel `[body, wheel]`, ground
+    `[body, ground]`."""
     spec: SceneSpec = eqx.field(static=True)
     """The scene that this is about; names the axes."""
     log_evidence: FloatScalar = eqx.field(converter=_scalar, default=float("nan"))

@@ -10,7 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from boomdp_jax.core.npz_file import read_npz, write_npz
-from boomdp_jax.physics.params import Distance, Ground, Params, Revolute, Wheel
+from boomdp_jax.physics.params import (
+    Distance,
+    Ground,
+    Params,
+    Prismatic,
+    Revolute,
+    Weld,
+    Wheel,
+)
 
 SCHEMA = "boomdp-posterior-1"
 MAX_HEADER_BYTES = 2**24
@@ -19,9 +27,14 @@ MAX_HEADER_BYTES = 2**24
 _GROUPS = {
     "revolute": Revolute,
     "distance": Distance,
+    "prismatic": Prismatic,
+    "weld": Weld,
     "wheel": Wheel,
     "ground": Ground,
 }
+_OPTIONAL = ("prismatic", "weld")
+"""Groups that a file may do without: scenes may, and those of earlier versions did."""
+
 _KINDS = {"active": "b", "body_a": "i", "body_b": "i", "chain": "i"}
 """Kind of an array by the last part of its name; all others hold floats."""
 
@@ -42,6 +55,8 @@ _SHAPES = {
     "log_evidence": (),
     "inferred.revolute": ("revolute slot",),
     "inferred.distance": ("distance slot",),
+    "inferred.prismatic": ("prismatic slot",),
+    "inferred.weld": ("weld slot",),
     "inferred.wheel": ("body", "wheel slot"),
     "inferred.ground": ("body", "ground slot"),
 }
@@ -49,12 +64,16 @@ _PARAM_SHAPES = {
     "density": ("body",),
     "revolute": ("revolute slot",),
     "distance": ("distance slot",),
+    "prismatic": ("prismatic slot",),
+    "weld": ("weld slot",),
     "wheel": ("body", "wheel slot"),
     "ground": ("body", "ground slot"),
 }
 _PAIRS = {
     "revolute": ("anchor_a", "anchor_b", "limit", "motor"),
     "distance": ("anchor_a", "anchor_b"),
+    "prismatic": ("anchor_a", "anchor_b", "limit", "motor"),
+    "weld": ("anchor_a", "anchor_b"),
     "wheel": ("position", "viscous", "dry"),
     "ground": ("load_shift",),
 }
@@ -116,6 +135,8 @@ def _flatten(prefix: str, params: Params) -> dict[str, np.ndarray]:
     arrays = {f"{prefix}.density": np.asarray(params.density)}
     for group in _GROUPS:
         module = getattr(params, group)
+        if module is None:
+            continue
         for field in dataclasses.fields(module):
             value = getattr(module, field.name)
             if value is not None:
@@ -127,6 +148,8 @@ def _unflatten(prefix: str, arrays: Mapping[str, np.ndarray]) -> Params:
     """Build params from arrays by dotted name."""
     groups: dict[str, Any] = {}
     for group, module in _GROUPS.items():
+        if not _has(group, arrays):
+            continue
         numbers: dict[str, Any] = dict.fromkeys(
             field.name for field in dataclasses.fields(module)
         )
@@ -135,6 +158,11 @@ def _unflatten(prefix: str, arrays: Mapping[str, np.ndarray]) -> Params:
             numbers[name] = None if array is None else jnp.asarray(array)
         groups[group] = module(**numbers)
     return Params(density=jnp.asarray(arrays[f"{prefix}.density"]), **groups)
+
+
+def _has(group: str, arrays: Mapping[str, np.ndarray]) -> bool:
+    """Whether a file has a group, or must have it."""
+    return group not in _OPTIONAL or f"inferred.{group}" in arrays
 
 
 def _read_header(path: str | os.PathLike, encoded: np.ndarray | None) -> dict:
@@ -164,10 +192,16 @@ def _read_header(path: str | os.PathLike, encoded: np.ndarray | None) -> dict:
 
 def _expected_shapes(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple]:
     """Axes of every array that must be there, and of nuisances that are there."""
-    shapes: dict[str, tuple] = dict(_SHAPES)
+    shapes: dict[str, tuple] = {
+        name: axes
+        for name, axes in _SHAPES.items()
+        if _has(name.removeprefix("inferred."), arrays)
+    }
     for prefix, draw in (("params", "draw"), ("prior_params", "prior draw")):
         shapes[f"{prefix}.density"] = (draw, *_PARAM_SHAPES["density"])
         for group, module in _GROUPS.items():
+            if not _has(group, arrays):
+                continue
             for field in dataclasses.fields(module):
                 name = f"{prefix}.{group}.{field.name}"
                 is_optional = field.default is None

@@ -6,7 +6,6 @@ import jax
 import numpy as np
 
 from boomdp_jax.inference.structure_report import (
-    KINDS,
     group_by_structure,
     report_slots,
     structure_name,
@@ -20,6 +19,8 @@ SCHEMA = "boomdp-infer-1"
 _UNITS = {
     "revolute": {"viscous": "N m s/rad", "dry": "N m"},
     "distance": {},
+    "prismatic": {"viscous": "N s/m", "dry": "N"},
+    "weld": {},
     "wheel": {"viscous": "N s/m", "dry": "N"},
     "ground": {"viscous": "N s/m", "dry": ""},
 }
@@ -27,6 +28,8 @@ _TITLES = {
     "anchor_a": "anchor on a",
     "anchor_b": "anchor on b",
     "length": "length",
+    "axis": "axis",
+    "angle": "angle of a against b",
     "pose": "place and heading",
     "along_axle": "along its axle",
     "across_axle": "across its axle",
@@ -153,7 +156,7 @@ def report_known(
 
     Args and entries are those of `report_structures`.
     """
-    known = {kind: ~inferred[kind] for kind in KINDS}
+    known = {kind: ~slots for kind, slots in inferred.items()}
     shift, names = _shift(spec), tuple(spec.names)
     report = []
     for slots, _, _ in group_by_structure(params, known, weights)[:1]:
@@ -259,6 +262,8 @@ def _units(kind: str, key: str) -> list[str]:
     """Units of each number of a quantity."""
     if key == "pose":
         return ["m", "m", "rad"]
+    if key in ("axis", "angle"):
+        return ["rad"]
     if key in ("viscous", "dry"):
         return [_UNITS[kind][key]] * (2 if kind == "wheel" else 1)
     return ["m", "m"] if key.startswith("anchor") else ["m"]

@@ -31,6 +31,18 @@ DEFAULT_SCALES: dict[str, Scale] = {
     "distance.anchor": Scale(0.0, 1.0),
     # In units of body radius plus spread of the positions: log-normal.
     "distance.length": Scale(1.0, 1.0),
+    # Of a drawer: its friction along the line, viscous over mass [1/s] and dry as a
+    # share of the weight, log-normal; how far the line passes from the mean of the
+    # observed positions, in units of body radius, and how far the angle is from the
+    # mean of the observed ones [rad], normal. Narrow, because the likelihood takes
+    # where a run starts as given, and a drawer has that line and that angle from there.
+    "prismatic.viscous_rate": Scale(0.1, 2.0),
+    "prismatic.dry_share": Scale(0.03, 2.0),
+    "prismatic.offset": Scale(0.0, 0.1),
+    "prismatic.angle": Scale(0.0, 0.1),
+    # Where a weld holds a body, likewise.
+    "weld.offset": Scale(0.0, 0.1),
+    "weld.angle": Scale(0.0, 0.1),
     # Wheel position in units of the outline's half extents: normal.
     "wheel.position": Scale(0.0, 0.7),
     # Lateral viscous coefficient over mass [1/s] and lateral limit over weight.
@@ -56,6 +68,8 @@ LOGARITHMIC = frozenset(
         "revolute.viscous_rate",
         "revolute.dry_share",
         "distance.length",
+        "prismatic.viscous_rate",
+        "prismatic.dry_share",
         "wheel.lateral_rate",
         "wheel.lateral_limit",
         "wheel.half_track",
@@ -68,6 +82,8 @@ LOGARITHMIC = frozenset(
 DEFAULT_PROBABILITY: dict[str, float] = {
     "revolute": 0.2,
     "distance": 0.1,
+    "prismatic": 0.1,
+    "weld": 0.1,
     "wheel": 0.3,
     "ground": 0.5,
     # Between two bodies rather than to the world.

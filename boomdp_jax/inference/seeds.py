@@ -1,4 +1,4 @@
-"""First guesses from linear least squares: where pins and axles would have to be."""
+"""First guesses from the readings: where pins, axles, drawers would have to be."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -113,6 +113,9 @@ def seed_coordinates(
         elif slot.kind == "wheel":
             values = _wheel_seed(coordinates, data, slot)
             where = slice(slot.start, slot.start + 3)
+        elif slot in layout.rests:
+            # Coordinates are measured from where the readings put it.
+            values, where = jnp.zeros(3), slice(slot.start, slot.start + 3)
         else:
             continue
         z = z.at[where].set(values)

@@ -6,11 +6,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.inference.layout import Layout, SlotKey
+from boomdp_jax.physics.constraint_spec import JOINTS
 from boomdp_jax.physics.params import WORLD, Params
 
 _FIELDS = {
     "revolute": ("anchor_a", "anchor_b", "viscous", "dry"),
     "distance": ("anchor_a", "anchor_b", "length"),
+    "prismatic": ("anchor_a", "anchor_b", "axis", "angle", "viscous", "dry"),
+    "weld": ("anchor_a", "anchor_b", "angle"),
     "wheel": ("position", "heading", "viscous", "dry", "half_track"),
     "ground": ("dry", "viscous", "torque_share", "load_shift"),
 }
@@ -58,7 +61,7 @@ def physical_numbers(
         numbers[f"{name}.mass"] = params.density[index] * area[index]
     for slot, name in slot_names(names, layout).items():
         group = getattr(params, slot.kind)
-        is_joint = slot.kind in ("revolute", "distance")
+        is_joint = slot.kind in JOINTS
         place = slot.index if is_joint else (slot.body_a, slot.index)
         for field in _FIELDS[slot.kind]:
             numbers[f"{name}.{field}"] = getattr(group, field)[place]

@@ -1,15 +1,15 @@
 """Which structures the draws have, with symmetric and relabelled ones merged.
 
 Two draws have the same structure where the same kinds of constraint act on the same
-bodies. Slots are interchangeable, a joint's ends may be swapped, and a wheel's heading
-may be turned by pi, or by pi/2 with its two coefficients swapped; all of these are
-undone here before anything is averaged. Only constraints whose existence is inferred
-count; known ones are part of the scene.
+bodies. Slots are interchangeable, a joint's ends may be swapped, a drawer's axis may be
+turned by pi, and a wheel's heading too, or by pi/2 with its two coefficients swapped;
+all of these are undone here before anything is averaged. Only constraints whose
+existence is inferred count; known ones are part of the scene.
 """
 
 import itertools
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,13 +19,15 @@ from boomdp_jax.inference.summary import (
     axial_mean,
     summarise,
 )
-from boomdp_jax.physics.params import WORLD, Distance, Params, Revolute
+from boomdp_jax.physics.constraint_spec import JOINTS
+from boomdp_jax.physics.params import WORLD, Params
 
-KINDS = ("revolute", "distance", "wheel", "ground")
 SCALES: dict[str, Scale | tuple[Scale, ...]] = {
     "anchor_a": "identity",
     "anchor_b": "identity",
     "length": "log",
+    "axis": "axial",
+    "angle": "identity",
     "pose": ("identity", "identity", "axial"),
     "viscous": "log",
     "dry": "log",
@@ -34,7 +36,14 @@ SCALES: dict[str, Scale | tuple[Scale, ...]] = {
 }
 """Scale on which each number is sampled, and its spread judged."""
 
-_WORDS = {"revolute": "pin", "distance": "rod", "wheel": "wheel", "ground": "friction"}
+_WORDS = {
+    "revolute": "pin",
+    "distance": "rod",
+    "prismatic": "slide",
+    "weld": "weld",
+    "wheel": "wheel",
+    "ground": "friction",
+}
 
 
 class Slots(NamedTuple):
@@ -71,7 +80,8 @@ def group_by_structure(
     """
     num_bodies = params.density.shape[1]
     codes = []
-    for kind in ("revolute", "distance"):
+    joints = [kind for kind in JOINTS if getattr(params, kind) is not None]
+    for kind in joints:
         joint = getattr(params, kind)
         end_a, end_b, _ = _ordered_ends(joint)
         code = end_a * (num_bodies + 1) + np.where(end_b == WORLD, num_bodies, end_b)
@@ -87,7 +97,7 @@ def group_by_structure(
     index = index.reshape(-1)
     groups = [
         StructureDraws(
-            slots=_decode(np.split(row, widths), num_bodies),
+            slots=_decode(joints, np.split(row, widths), num_bodies),
             probability=float(weights[index == number].sum()),
             draws=np.flatnonzero(index == number),
         )
@@ -159,7 +169,7 @@ def report_slots(
         mine = _to_outline_frame(slots, mine, shift)
         theirs = theirs and _to_outline_frame(slots, theirs, shift)
         entry: dict = {"type": slots.kind, "a": names[slots.body_a]}
-        if slots.kind in ("revolute", "distance"):
+        if slots.kind in JOINTS:
             entry["b"] = "world" if slots.body_b == WORLD else names[slots.body_b]
         for key, value in mine.items():
             reference = theirs[key] if theirs else None
@@ -184,18 +194,10 @@ def constraint_draws(
     """
     kind, body_a, body_b, count = slots
     group = getattr(params, kind)
-    if kind in ("revolute", "distance"):
+    if kind in JOINTS:
         end_a, end_b, is_swapped = _ordered_ends(group)
         matches = group.active & inferred[kind] & (end_a == body_a) & (end_b == body_b)
-        swap = is_swapped[..., None]
-        numbers = {
-            "anchor_a": np.where(swap, group.anchor_b, group.anchor_a),
-            "anchor_b": np.where(swap, group.anchor_a, group.anchor_b),
-        }
-        if isinstance(group, Revolute):
-            numbers |= {"viscous": group.viscous, "dry": group.dry}
-        else:
-            numbers |= {"length": group.length}
+        numbers = _joint_numbers(group, is_swapped)
     else:
         matches = group.active[:, body_a] & inferred[kind][body_a]
         if kind == "wheel":
@@ -210,6 +212,24 @@ def constraint_draws(
     rows = np.flatnonzero(matches.sum(axis=1) >= count)
     order = np.argsort(~matches[rows], axis=1, kind="stable")[:, :count]
     return rows, {key: value[rows[:, None], order] for key, value in numbers.items()}
+
+
+def _joint_numbers(joint: Any, is_swapped: np.ndarray) -> dict[str, np.ndarray]:
+    """Numbers of joints from the end with the lower body, axes modulo pi."""
+    swap = is_swapped[..., None]
+    numbers = {
+        "anchor_a": np.where(swap, joint.anchor_b, joint.anchor_a),
+        "anchor_b": np.where(swap, joint.anchor_a, joint.anchor_b),
+    }
+    if hasattr(joint, "axis"):
+        axis = joint.axis - np.where(is_swapped, joint.angle, 0.0)
+        numbers["axis"] = axial_difference(axis, 0.0)
+    if hasattr(joint, "angle"):
+        numbers["angle"] = np.where(is_swapped, -joint.angle, joint.angle)
+    for name in ("length", "viscous", "dry"):
+        if hasattr(joint, name):
+            numbers[name] = getattr(joint, name)
+    return numbers
 
 
 def axle_offsets(
@@ -227,9 +247,7 @@ def axle_offsets(
     return along, across
 
 
-def _ordered_ends(
-    joint: Revolute | Distance,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _ordered_ends(joint: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Ends with the lower body first and the world last, and whether they swapped."""
     far = np.iinfo(joint.body_a.dtype).max
     rank_a = np.where(joint.body_a == WORLD, far, joint.body_a)
@@ -240,16 +258,19 @@ def _ordered_ends(
     return end_a, end_b, is_swapped
 
 
-def _decode(codes: list[np.ndarray], num_bodies: int) -> tuple[Slots, ...]:
+def _decode(
+    joints: list[str], codes: list[np.ndarray], num_bodies: int
+) -> tuple[Slots, ...]:
     """Read back what `group_by_structure` wrote into one row."""
     slots = []
-    for kind, code in zip(KINDS[:2], codes[:2], strict=True):
+    num = len(joints)
+    for kind, code in zip(joints, codes[:num], strict=True):
         for value, count in zip(*np.unique(code, return_counts=True), strict=True):
             if value >= 0:
                 body_a, body_b = divmod(int(value), num_bodies + 1)
                 partner = WORLD if body_b == num_bodies else body_b
                 slots.append(Slots(kind, body_a, partner, int(count)))
-    for kind, counts in zip(KINDS[2:], codes[2:], strict=True):
+    for kind, counts in zip(("wheel", "ground"), codes[num:], strict=True):
         for body, count in enumerate(counts):
             if count > 0:
                 slots.append(Slots(kind, body, WORLD, int(count)))

@@ -9,6 +9,7 @@ import numpy as np
 
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.summary import CHANNELS
+from boomdp_jax.physics.constraint_spec import JOINTS, KINDS
 
 _SUFFIX_DIMS = {
     "anchor_a": ("axis",),
@@ -97,14 +98,13 @@ def _variables(
         "noise_scale": ["body", "channel"],
     }
     slot_dims = {
-        "revolute": ["revolute"],
-        "distance": ["distance"],
+        **{kind: [kind] for kind in JOINTS},
         "wheel": ["body", "wheel"],
         "ground": ["body", "ground"],
     }
     for kind, axes in slot_dims.items():
         group = getattr(params, kind)
-        if group.active.shape[-1] == 0:
+        if group is None or group.active.shape[-1] == 0:
             continue
         for field, array in vars(group).items():
             if array is None:
@@ -129,8 +129,9 @@ def _coordinates(posterior: Posterior) -> dict[str, list]:
         "channel": list(CHANNELS),
         "axis": ["x", "y"],
         "direction": ["rolling", "lateral"],
-        "revolute": list(range(params.revolute.active.shape[-1])),
-        "distance": list(range(params.distance.active.shape[-1])),
-        "wheel": list(range(params.wheel.active.shape[-1])),
-        "ground": list(range(params.ground.active.shape[-1])),
+        **{
+            kind: list(range(getattr(params, kind).active.shape[-1]))
+            for kind in KINDS
+            if getattr(params, kind) is not None
+        },
     }

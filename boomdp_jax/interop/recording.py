@@ -17,7 +17,6 @@ from jaxtyping import Float, Int
 
 from boomdp_jax.core.transition_table import TransitionTable
 from boomdp_jax.interop.mjcf import RecordingLaws, has_contacts, world_text
-from boomdp_jax.physics.constraint_spec import KINDS
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene_spec import SceneSpec
 
@@ -129,13 +128,13 @@ def _single_object(truth: SceneSpec) -> Params:
     if truth.num_bodies != 1:
         raise ValueError(f"truth: expected one body, got {truth.num_bodies}")
     params = jax.tree.map(np.asarray, truth.params())
+    most = {"revolute": 1, "distance": 0, "wheel": 1, "ground": 1}
     for each in truth.constraints:
-        if each.kind not in KINDS or {"limit", "motor"} & each.numbers.keys():
+        if each.kind not in most or {"limit", "motor"} & each.numbers.keys():
             raise ValueError(
-                f"truth: expected {', '.join(KINDS)} without limits and motors, got "
+                f"truth: expected {', '.join(most)} without limits and motors, got "
                 f"{each.kind} with {', '.join(each.numbers)}"
             )
-    most = {"revolute": 1, "distance": 0, "wheel": 1, "ground": 1}
     for kind, cap in most.items():
         count = int(getattr(params, kind).active.sum())
         if count > cap:

@@ -17,14 +17,11 @@ from boomdp_jax.physics.scene_fields import (
     refuse,
 )
 
-KINDS = ("revolute", "distance", "wheel", "ground")
-"""Every kind of constraint that can be inferred, in the order of reports."""
-
 JOINTS = ("revolute", "distance", "prismatic", "weld")
 """Kinds that have a partner."""
 
-KNOWN_KINDS = (*KINDS, "prismatic", "weld")
-"""Every kind of constraint that a scene file can tell of."""
+KINDS = (*JOINTS, "wheel", "ground")
+"""Every kind of constraint, in the order of reports."""
 
 _ENDS = ("type", "a", "b", "anchor_a", "anchor_b")
 _RANGE = ("lower", "upper")
@@ -94,8 +91,8 @@ def read_constraint(
     if not isinstance(value, dict):
         refuse(where, "an object", value)
     kind = value.get("type")
-    if not isinstance(kind, str) or kind not in KNOWN_KINDS:
-        refuse(f"{where}: type", f"one of {', '.join(KNOWN_KINDS)}", kind)
+    if not isinstance(kind, str) or kind not in KINDS:
+        refuse(f"{where}: type", f"one of {', '.join(KINDS)}", kind)
     required, optional = _FIELDS[kind]
     where = f"{where} ({kind})"
     fields = read_object(value, where, required=required, optional=optional)
@@ -210,9 +207,8 @@ def _read_joint(
     bodies: Sequence[BodySpec],
 ) -> dict[str, object]:
     """Anchors about the centres of mass, and what else a kind holds."""
-    can_infer = kind in KINDS
     anchor_a, anchor_b = (
-        read_vector(fields[key], f"{where}: {key}", 2, is_nullable=can_infer)
+        read_vector(fields[key], f"{where}: {key}", 2, is_nullable=True)
         for key in ("anchor_a", "anchor_b")
     )
     numbers: dict[str, object] = {
@@ -224,9 +220,13 @@ def _read_joint(
             fields["length"], f"{where}: length", is_positive=True, is_nullable=True
         )
     if kind == "prismatic":
-        numbers["axis"] = read_number(fields["axis"], f"{where}: axis")
+        numbers["axis"] = read_number(
+            fields["axis"], f"{where}: axis", is_nullable=True
+        )
     if kind in ("prismatic", "weld"):
-        numbers["angle"] = read_number(fields.get("angle", 0.0), f"{where}: angle")
+        numbers["angle"] = read_number(
+            fields.get("angle", 0.0), f"{where}: angle", is_nullable=True
+        )
     return numbers
 
 

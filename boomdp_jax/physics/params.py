@@ -146,6 +146,8 @@ def empty_params(
     num_distance: int = 0,
     num_wheel: int = 0,
     num_ground: int = 0,
+    num_prismatic: int = 0,
+    num_weld: int = 0,
     density: float = 1.0,
     friction: float | None = None,
     restitution: float = 0.0,
@@ -158,6 +160,9 @@ def empty_params(
         num_distance: distance slots of the whole scene.
         num_wheel: wheel slots of each body.
         num_ground: ground slots of each body.
+        num_prismatic: prismatic slots of the whole scene; without one there is no
+            such group at all, and a lone body keeps its quick step.
+        num_weld: weld slots of the whole scene, likewise.
         density: density of every body [kg/m²].
         friction: contact friction of every body; None: the params have no surface,
             which scenes with contact need.
@@ -204,4 +209,16 @@ def empty_params(
             friction=on_device(np.full(num_bodies, friction)),
             restitution=on_device(np.full(num_bodies, restitution)),
         ),
+        prismatic=Prismatic(
+            **joint_slots(num_prismatic),
+            **{
+                key: on_device(np.zeros(num_prismatic))
+                for key in ("axis", "angle", "viscous", "dry")
+            },
+        )
+        if num_prismatic
+        else None,
+        weld=Weld(**joint_slots(num_weld), angle=on_device(np.zeros(num_weld)))
+        if num_weld
+        else None,
     )

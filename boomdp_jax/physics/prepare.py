@@ -24,6 +24,12 @@ from boomdp_jax.physics.implicit_fit import (
 )
 from boomdp_jax.physics.joints import Ends, Joints, joints_of, of_body
 from boomdp_jax.physics.lone_body import LoneBody, Pin, lone_body
+from boomdp_jax.physics.lone_rail import (
+    Rail,
+    can_be_on_rail,
+    rail_of,
+    rail_params,
+)
 from boomdp_jax.physics.params import Params, Prismatic, Revolute
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.small_linear import dot3, matvec3
@@ -88,17 +94,20 @@ class Prepared(NamedTuple):
 def is_lone(scene: Scene, params: Params) -> bool:
     """Whether there is one body, with what `lone_body` knows to solve at once."""
     pins = params.revolute
-    extras = (params.prismatic, params.weld, pins.limit, pins.motor)
     return (
         scene.num_bodies == 1
         and pins.active.shape[-1] <= 1
         and params.distance.active.shape[-1] == 0
-        and all(extra is None for extra in extras)
+        and pins.limit is None
+        and pins.motor is None
+        and can_be_on_rail(params)
         and contact_groups(scene, params).num_contacts <= MOST_LONE_CONTACTS
     )
 
 
-def prepare_lone(scene: Scene, params: Params, length: FloatScalar) -> LoneBody:
+def prepare_lone(
+    scene: Scene, params: Params, length: FloatScalar
+) -> tuple[LoneBody, Rail | None]:
     """Prepare a scene of which `is_lone` holds.
 
     Args:
@@ -107,13 +116,16 @@ def prepare_lone(scene: Scene, params: Params, length: FloatScalar) -> LoneBody:
         length: of a step [s].
 
     Returns:
-        All that its time loop needs.
+        All that its time loop needs, and what else holds the body.
     """
+    rail = rail_of(params)
+    if rail is not None:
+        scene, params = rail_params(scene, params)
     bodies, groups = prepare_bodies(scene, params, length)
     facing = jnp.zeros_like(bodies.mass)
     if groups.num_wheels:
         facing = wheel_headings(params.wheel)[0, 0]
-    return lone_body(
+    body = lone_body(
         bodies.length,
         bodies.mobile,
         bodies.mass,
@@ -125,6 +137,7 @@ def prepare_lone(scene: Scene, params: Params, length: FloatScalar) -> LoneBody:
         bodies.spins,
         _pins(params.revolute, bodies.mass.dtype),
     )
+    return body, rail
 
 
 def prepare_world(

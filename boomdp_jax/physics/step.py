@@ -52,6 +52,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from boomdp_jax.physics.lone_body import LoneBody
+from boomdp_jax.physics.lone_rail import Rail, after_step, before_step
 from boomdp_jax.physics.lone_step import lone_step
 from boomdp_jax.physics.motion import Motion, motion_of, scalars, state_of
 from boomdp_jax.physics.params import Params
@@ -179,10 +180,11 @@ def _step_of(scene: Scene, params: Params, length: Array) -> Callable:
 
 
 def _lone(
-    scene: Scene, body: LoneBody, motion: Motion, wrench
+    scene: Scene, held: tuple[LoneBody, Rail | None], motion: Motion, wrench
 ) -> tuple[Motion, StepInfo]:
     """All substeps of one step."""
-    motion, error, is_finite = lone_step(
-        body, motion, scalars(wrench), scene.num_substeps
-    )
+    body, rail = held
+    motion, force = before_step(rail, motion, scalars(wrench))
+    motion, error, is_finite = lone_step(body, motion, force, scene.num_substeps)
+    motion = after_step(rail, motion)
     return motion, StepInfo(constraint_error=error, is_finite=is_finite)

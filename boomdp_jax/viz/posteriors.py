@@ -8,16 +8,20 @@ import numpy as np
 
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.structure_report import (
-    KINDS,
     Slots,
     axle_offsets,
     constraint_draws,
     group_by_structure,
     relabel,
 )
-from boomdp_jax.inference.summary import axial_mean, weighted_quantiles
+from boomdp_jax.inference.summary import (
+    axial_difference,
+    axial_mean,
+    weighted_quantiles,
+)
+from boomdp_jax.physics.constraint_spec import JOINTS, KINDS
 from boomdp_jax.physics.params import WORLD, Params
-from boomdp_jax.viz.style import BY_KIND, EDGE, FLOOR, OUTLINE_STYLE, PIN, WHEEL
+from boomdp_jax.viz.style import BY_KIND, EDGE, FLOOR, OUTLINE_STYLE, PIN, SLIDE, WHEEL
 
 _LEAST_DRAWN = 0.05
 """Probability below which a constraint is left out of the picture."""
@@ -34,7 +38,8 @@ def draw_posterior(
 ) -> None:
     """Draw a body's outline with inferred pins, rods, wheels and floor friction.
 
-    A pin or a rod's end is a cloud of draws with its 90 % ellipse. A wheel is its axle
+    A pin, a rod's end or a weld is a cloud of draws with its 90 % ellipse; a drawer is
+    its line, as the body has it where it was seen. A wheel is its axle
     line, the 90 % band of that line, and an arrow along its heading. All is in the
     frame of the outline as authored.
 
@@ -56,7 +61,11 @@ def draw_posterior(
         draws, _ = relabel(draws, weight, None)
         for place in range(slots.count):
             mine = {key: value[:, place] for key, value in draws.items()}
-            if slots.kind in ("revolute", "distance"):
+            if slots.kind == "prismatic":
+                label = _joint_label(slots, posterior.spec.names, body)
+                is_first = slots.body_a == body
+                _draw_slide(ax, mine, weight, spec, is_first, label, probability)
+            elif slots.kind in JOINTS:
                 key = "anchor_a" if slots.body_a == body else "anchor_b"
                 anchor = mine[key] + spec.shift
                 label = _joint_label(slots, posterior.spec.names, body)
@@ -154,6 +163,35 @@ def _draw_cloud(
         color=colour,
         linestyle="",
         label=text,
+        zorder=6,
+    )
+
+
+def _draw_slide(
+    ax: Any,
+    numbers: dict[str, np.ndarray],
+    weight: np.ndarray,
+    spec: Any,
+    is_first: bool,
+    label: str,
+    probability: float,
+) -> None:
+    """The mean line of a drawer through its mean anchor on this body."""
+    # The line is fixed in the partner, and the body in its angle against that.
+    turned = numbers["axis"] - (numbers["angle"] if is_first else 0.0)
+    centre = axial_mean(turned, weight)
+    spread = np.sqrt(weight @ axial_difference(turned, centre) ** 2)
+    anchor = weight @ numbers["anchor_a" if is_first else "anchor_b"] + spec.shift
+    direction = np.array([np.cos(centre), np.sin(centre)])
+    ends = anchor + spec.reach * np.array([[-1.0], [1.0]]) * direction
+    ax.plot(
+        *ends.T,
+        color=SLIDE,
+        linewidth=2,
+        label=(
+            f"{label} {probability:.2f}: axis {np.degrees(centre):.2f}° "
+            f"± {np.degrees(spread):.2f}°"
+        ),
         zorder=6,
     )
 
@@ -298,7 +336,8 @@ def _some(weight: np.ndarray) -> np.ndarray:
 
 
 def _joint_label(slots: Slots, names: tuple[str, ...], body: int) -> str:
-    word = "pin" if slots.kind == "revolute" else "rod"
+    words = {"revolute": "pin", "distance": "rod", "prismatic": "slide", "weld": "weld"}
+    word = words[slots.kind]
     other = slots.body_b if slots.body_a == body else slots.body_a
     return word if other == WORLD else f"{word} to {names[other]}"
 

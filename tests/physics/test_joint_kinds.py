@@ -252,9 +252,9 @@ def test_a_scene_file_keeps_them(tmp_path):
         ({"lower": 1.0, "upper": 0.0}, "upper: expected a number of at least 1"),
         ({"motor_speed": 1.0}, "motor_force"),
         ({"motor_speed": 1.0, "motor_force": -1.0}, "motor_force: expected"),
-        ({"axis": None}, "axis: expected"),
+        ({"axis": "up"}, "axis: expected"),
         ({"angle": "flat"}, "angle: expected"),
-        ({"anchor_a": None}, "anchor_a: expected"),
+        ({"anchor_a": "hinge"}, "anchor_a: expected"),
     ],
 )
 def test_what_is_wrong_is_named(change, message):
@@ -264,8 +264,8 @@ def test_what_is_wrong_is_named(change, message):
 
 
 def test_inference_refuses_what_it_does_not_know():
-    spec = drawer()
+    spec = drawer(lower=-1.0, upper=1.0)
     states = np.zeros((3, 1, 6))
     history = make_history(states, np.zeros((3, 1, 3)), states, dt=0.02)
-    with pytest.raises(ValueError, match="got prismatic"):
+    with pytest.raises(ValueError, match="got prismatic with a limit"):
         infer(jax.random.key(0), spec, history)

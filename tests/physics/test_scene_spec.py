@@ -246,7 +246,8 @@ def test_normal_gravity_is_there_where_the_plane_is_level(
 
 def test_a_missing_cap_is_zero():
     spec = scene_spec_from_dict(_scene())
-    assert spec.unknown == {"revolute": 0, "distance": 0, "wheel": 1, "ground": 0}
+    others = ("revolute", "distance", "prismatic", "weld", "ground")
+    assert spec.unknown == {"wheel": 1, **dict.fromkeys(others, 0)}
 
 
 @pytest.mark.parametrize("path", [None, ["bodies", 1, "center_of_mass"]])

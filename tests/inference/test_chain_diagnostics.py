@@ -1,0 +1,31 @@
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpyro.diagnostics import effective_sample_size
+
+from boomdp_jax.inference.chain_diagnostics import diagnose_chains
+from boomdp_jax.inference.structure_chain import ChainDraws
+from boomdp_jax.inference.target import StructureTarget
+
+
+def test_an_angle_close_to_zero_is_judged_beyond_single_precision():
+    """Its cosine is one to single precision, but for a few draws far out."""
+    rng = np.random.default_rng(0)
+    z = (4e-5 * rng.standard_normal((4, 256, 1))).astype(np.float32)
+    target = StructureTarget(
+        log_likelihood=lambda z, active: jnp.zeros(()),
+        structures=jnp.ones((1, 0), bool),
+        log_prior=jnp.zeros(1),
+        slot=jnp.full(1, -1, jnp.int32),
+        period=jnp.full(1, np.pi, jnp.float32),
+    )
+    draws = ChainDraws(
+        jnp.zeros((4, 256), jnp.int32),
+        jnp.asarray(z),
+        jnp.asarray(rng.standard_normal((4, 256))),
+    )
+    verdict = diagnose_chains(target, draws)
+    cosine = np.cos(2.0 * z[..., 0].astype(float))
+    expected = float(effective_sample_size(cosine))
+    assert verdict.effective_sample_size["z_0_cos"] == pytest.approx(expected)
+    assert verdict.ok, verdict.reasons
