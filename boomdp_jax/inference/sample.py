@@ -140,7 +140,7 @@ def sample_blocks(
         structure=structure,
         z=z,
         log_density=np.asarray(draws.log_density).reshape(structure.shape),
-        noise_scale=_noise(noise_key, targets, structure, z),
+        noise_scale=draw_noise_scales(noise_key, targets, structure, z),
         log_evidence=np.logaddexp.reduce(log_joint, axis=-1),
         importance_probability=evidence.probability,
         importance_size=evidence.effective_sample_size,
@@ -204,7 +204,7 @@ def _diagnose(
     )
 
 
-def _noise(key: Key, targets: StructureTarget, structure, z) -> np.ndarray:
+def draw_noise_scales(key: Key, targets: StructureTarget, structure, z) -> np.ndarray:
     """Noise scales given every draw, from their inverse-gamma distribution."""
     num_objects, num_draws = structure.shape
     index = np.repeat(np.arange(num_objects), num_draws)
