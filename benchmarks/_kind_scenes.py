@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from boomdp_jax.core.history import History, make_history
-from boomdp_jax.physics import State, rollout
+from boomdp_jax.physics import Params, State, rollout
+from boomdp_jax.physics.params import WORLD, empty_params
 from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
 
 KINDS = ("light box", "heavy box", "cart", "pinned table")
@@ -151,8 +152,71 @@ def draw_pushes(rng, truth: SceneSpec, num_rows: int) -> np.ndarray:
 
 def run(truth: SceneSpec, wrench: np.ndarray) -> np.ndarray:
     """True states from rest, the first one included, `[time + 1, body, 6]`."""
-    start = State(jnp.asarray(truth.pose, float), jnp.zeros((truth.num_bodies, 3)))
-    states, _ = jax.jit(rollout)(
-        truth.scene, truth.params(), start, jnp.asarray(wrench, float)
+    start = np.concatenate([truth.pose, np.zeros_like(truth.pose)], axis=-1)
+    params = jax.tree.map(lambda leaf: np.asarray(leaf)[None], truth.params())
+    return np.concatenate([start[None], predict(truth, params, wrench)[0]])
+
+
+def predict(spec: SceneSpec, params: Params, wrench: np.ndarray) -> np.ndarray:
+    """States from rest under every hypothesis, `[draw, time, body, 6]`.
+
+    Bodies do not touch, so that each is a scene of its own: one small program serves
+    them all, where that of the whole room would take a minute to compile.
+    """
+    parts = []
+    for i, body in enumerate(spec.bodies):
+        content = spec.to_dict() | {"constraints": [], "unknown": {}, "prior": {}}
+        content["bodies"] = [content["bodies"][i]]
+        scene = scene_spec_from_dict(content, source=body.name).scene
+        start = jnp.asarray(spec.pose[i : i + 1], float)
+        push = jnp.asarray(wrench[:, i : i + 1], float)
+        parts.append(np.asarray(_roll(scene, lone_params(params, i), start, push)))
+    return np.concatenate(parts, axis=2)
+
+
+@jax.jit
+def _roll(scene, params: Params, pose, wrench):
+    start = State(pose, jnp.zeros_like(pose))
+    return jax.vmap(lambda params: rollout(scene, params, start, wrench)[0].array)(
+        params
     )
-    return np.concatenate([np.asarray(start.array)[None], np.asarray(states.array)])
+
+
+def lone_params(params: Params, body: int) -> Params:
+    """What hypotheses say of one body, as a scene of its own with a slot of each kind.
+
+    Args:
+        params: of a room, with a leading draw axis.
+        body: which body.
+    """
+    density = np.asarray(params.density)
+    num = len(density)
+    lone = empty_params(1, num_revolute=1, num_wheel=1, num_ground=1)
+    owner = np.flatnonzero(np.asarray(params.revolute.body_a)[0] == body)
+    out = {"density": jnp.asarray(density[:, body : body + 1], float)}
+    for kind in ("revolute", "wheel", "ground"):
+        group, template = getattr(params, kind), getattr(lone, kind)
+        is_joint = kind == "revolute"
+        fields = {}
+        for name, empty in vars(template).items():
+            value = getattr(group, name)
+            if name in ("limit", "motor"):
+                continue
+            if name in ("body_a", "body_b"):
+                fields[name] = jnp.full((num, 1), 0 if name == "body_a" else WORLD)
+                continue
+            if empty is None:
+                pair = (2,) if name == "load_shift" else ()
+                empty = np.zeros((1, 1, *pair))
+            empty = np.asarray(empty)
+            whole = np.broadcast_to(empty, (num, *empty.shape))
+            if value is not None and is_joint and len(owner):
+                whole = np.asarray(value)[:, owner[:1]]
+            elif value is not None and not is_joint and np.asarray(value).shape[2]:
+                whole = np.asarray(value)[:, body : body + 1, :1]
+            fields[name] = jnp.asarray(whole)
+        out[kind] = type(template)(**fields)
+    nothing = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (num, *leaf.shape)), lone.distance
+    )
+    return Params(distance=nothing, **out)

@@ -11,12 +11,12 @@ and of the mean, which the prior's tails of very light objects spoil; log score 
 a normal distribution with the draws' mean and variance.
 """
 
+import sys
 import time
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from _kind_scenes import KINDS, NOISE, Room, draw_pushes, make_room, run
+from _kind_scenes import KINDS, NOISE, Room, draw_pushes, make_room, predict, run
 from _report import Reporter, parser_of
 
 from boomdp_jax.inference.kind_chains import KindSettings
@@ -25,7 +25,6 @@ from boomdp_jax.inference.kind_prior import KindPrior
 from boomdp_jax.inference.kinds import infer_kinds_of
 from boomdp_jax.inference.kinds_posterior import KindsPosterior
 from boomdp_jax.inference.sample import SampleSettings
-from boomdp_jax.physics import Params, State, rollout
 
 HORIZONS = (5, 20)
 """Steps ahead, of 40 ms."""
@@ -48,7 +47,7 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.quick:
         arguments.rooms, arguments.bodies = 1, 8
-    settings = KindSettings(num_warmup=60, num_samples=100)
+    settings = KindSettings(num_warmup=50, num_samples=70)
     sampling = SampleSettings()
     if arguments.quick:
         settings = KindSettings(num_chains=16, num_warmup=15, num_samples=15)
@@ -68,6 +67,8 @@ def main() -> None:
         one = score_room(rng, key, room, settings, sampling)
         for name, score in one.items():
             scores[name].append(score)
+            error = np.sqrt(np.mean(score["median"] ** 2, axis=1)).round(4)
+            print(f"room {number}, {name}: {error} m", file=sys.stderr, flush=True)
     for name in CASES:
         report_case(reporter, name, scores[name], scores["separate"])
     reporter.print_table()
@@ -105,15 +106,8 @@ def score_room(rng, key, room: Room, settings, sampling) -> dict[str, dict]:
 def score_prediction(room: Room, found: KindsPosterior, wrench, truth) -> dict:
     """Errors `[horizon, body]` and log scores over objects that were not touched."""
     posterior = found.posterior.thin(NUM_DRAWS)
-    states = np.asarray(
-        _roll(
-            room.seen.scene,
-            posterior.params,
-            jnp.asarray(room.truth.pose, float),
-            jnp.asarray(wrench, float),
-        ),
-        float,
-    )
+    states = predict(room.seen, posterior.params, wrench)
+    states = states[:, np.array(HORIZONS) - 1]
     pose = states[:, :, ~room.is_pushed, :3]
     right = truth[:, ~room.is_pushed, :3]
     mean, median = pose.mean(0), np.median(pose, axis=0)
@@ -125,18 +119,6 @@ def score_prediction(room: Room, found: KindsPosterior, wrench, truth) -> dict:
         "angle": np.abs((median - right)[..., 2]),
         "log_score": score.sum(-1),
     }
-
-
-@jax.jit
-def _roll(scene, params: Params, pose, wrench):
-    """States of every draw at the horizons, from rest."""
-    start = State(pose, jnp.zeros_like(pose))
-
-    def one(params):
-        states, _ = rollout(scene, params, start, wrench)
-        return states.array[jnp.array(HORIZONS) - 1]
-
-    return jax.lax.map(one, params, batch_size=32)
 
 
 def score_kinds(room: Room, found: KindsPosterior) -> dict:
