@@ -316,7 +316,7 @@ def _posteriors(
             spec,
             results[scene],
             seconds={},
-            notes=["bodies are taken not to be tied to each other"],
+            notes=_notes(objects, scene),
             method="kinds",
         )
         posteriors.append(
@@ -327,6 +327,16 @@ def _posteriors(
             )
         )
     return posteriors
+
+
+def _notes(objects: ObjectsAlone, scene: int) -> list[str]:
+    notes = ["bodies are taken not to be tied to each other"]
+    at_rest = [b.name for b in objects.bodies if b.scene == scene and b.bumps is None]
+    if at_rest:
+        notes.append(
+            f"known by their kinds alone, never in motion: {', '.join(at_rest)}"
+        )
+    return notes
 
 
 def _noise(key: Key, objects: ObjectsAlone, structure, z) -> list[np.ndarray]:

@@ -215,6 +215,28 @@ def test_bodies_that_nobody_saw_keep_the_prior_and_share_it():
     assert active.mean() == pytest.approx(0.5, abs=0.1)
 
 
+def test_several_scenes_share_kinds():
+    spec = scene([box("a")], unknown={"ground": 1})
+    nothing = nothing_seen(1)
+    found = infer_kinds(
+        jax.random.key(2),
+        [spec, spec],
+        [nothing, nothing],
+        num_warmup=5,
+        num_samples=8,
+        sampler="sticks",
+        use_outlines=False,
+    )
+    assert found.names == ("0.a", "1.a")
+    assert found.kind.shape == (256, 2)
+    notes = found.posteriors[1].diagnostics["notes"]
+    assert "known by their kinds alone, never in motion: a" in notes
+    same = found.kind[:, 0] == found.kind[:, 1]
+    one, other = (np.log(p.params.density[:, 0]) for p in found.posteriors)
+    assert np.median(np.abs(one - other)[same]) < 0.5
+    assert np.median(np.abs(one - other)[~same]) > 0.5
+
+
 @pytest.mark.slow
 def test_an_untouched_box_is_known_from_its_like(tmp_path):
     """Two boxes are pushed; a third one and one in another room look the same."""
