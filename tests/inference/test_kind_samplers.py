@@ -9,8 +9,10 @@ import pytest
 from scipy import special, stats
 
 from boomdp_jax.inference.kind_chains import KindSettings, run_kind_chains
+from boomdp_jax.inference.kind_coordinates import CoordinateModel
 from boomdp_jax.inference.kind_prior import KindPrior
 from boomdp_jax.inference.kind_state import KindData, log_joint
+from boomdp_jax.inference.likelihood_bumps import bump_of_posterior, join_bumps
 from tests.inference.kind_problems import (
     NOISE,
     STRUCTURE_PRIOR,
@@ -256,3 +258,73 @@ def test_objects_come_out_in_any_order():
 def test_counter_of_partitions_is_complete():
     """Bell number of five."""
     assert len(Counter(partitions(5))) == 52
+
+
+HEADING = np.array([1.5, -1.4])
+"""Either side of where headings are cut, 0.24 rad apart."""
+TURN, SHARPNESS = 2.0, 6.0
+
+
+def log_heading(index: np.ndarray, z: np.ndarray) -> np.ndarray:
+    return SHARPNESS * np.cos(TURN * (z - HEADING[index]))
+
+
+def headings() -> KindData:
+    """Two objects of which only a heading is known, not too well."""
+    period = np.array([np.pi])
+    bumps = []
+    for heading in HEADING:
+        # A normal posterior near the true one, its evidence by quadrature.
+        covariance = np.array([[1.3 / (SHARPNESS * TURN**2)]])
+        evidence = float(np.log(special.i0(SHARPNESS)))
+        mean = np.array([heading + 0.05])
+        bump = bump_of_posterior(
+            0, np.array([True]), period, mean, covariance, evidence
+        )
+        bumps.append(join_bumps([bump]))
+    return KindData(
+        coordinates=CoordinateModel(
+            period, np.array([[0.1, np.inf]]), np.log([[0.7, 0.3]])
+        ),
+        in_use=np.array([[True]]),
+        log_prior=np.zeros(1),
+        bumps=tuple(bumps),
+        label=np.full(2, -1),
+        num_labels=0,
+        feature=np.zeros((2, 0)),
+        log_likelihood=lambda index, structure, z: log_heading(index, z[:, 0]),
+        prior=KindPrior(),
+    )
+
+
+@pytest.mark.parametrize(
+    "sampler", ["collapsed", pytest.param("sticks", marks=pytest.mark.slow)]
+)
+def test_headings_that_meet_at_the_cut_are_taken_together(sampler):
+    grid = (np.arange(300) + 0.5) / 300 * np.pi - np.pi / 2
+    likelihood = np.exp([log_heading(np.full(300, i), grid) for i in range(2)])
+    kappa = (TURN * 0.1) ** -2
+    within = stats.vonmises.pdf(TURN * (grid[:, None] - grid[None]), kappa) * TURN
+    # Averages over the grid are integrals over the uniform prior.
+    given = likelihood @ within * np.pi / 300
+    apart = likelihood.mean(1).prod()
+    close = (given[0] * given[1]).mean()
+    same = (0.7 * close + 0.3 * apart) / (1 + CONCENTRATION)
+    other = apart * CONCENTRATION / (1 + CONCENTRATION)
+    sine = np.sin(TURN * grid)
+    first = (likelihood[0] * sine) @ within * np.pi / 300
+    moved = (0.7 * (first * given[1]).mean()) / (1 + CONCENTRATION)
+    alone = (likelihood[0] * sine).mean() * likelihood[1].mean()
+    moved += alone * (0.3 / (1 + CONCENTRATION) + CONCENTRATION / (1 + CONCENTRATION))
+    settings = KindSettings(
+        64, 40, 250, sampler, num_kinds=25, concentration=CONCENTRATION
+    )
+    draws = run_kind_chains(np.random.default_rng(6), headings(), settings)
+    found = np.stack(
+        [
+            (draws.kind[..., 0] == draws.kind[..., 1]).mean(1),
+            np.sin(TURN * draws.z[:, :, 0, 0]).mean(1),
+        ],
+        axis=1,
+    )
+    check_chain_means(found, np.array([same, moved]) / (same + other))
