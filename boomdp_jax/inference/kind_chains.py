@@ -21,10 +21,6 @@ SAMPLERS = ("collapsed", "sticks")
 """Ways to sample; see `collapsed_gibbs` and `stick_breaking`."""
 
 
-# States of every chain that are kept whole, as what is learnt of the kinds.
-_NUM_STATES = 2
-
-
 class KindSettings(NamedTuple):
     """How much to draw."""
 
@@ -54,8 +50,8 @@ class KindDraws(NamedTuple):
     """`[chain, draw]`."""
     acceptance: np.ndarray
     """Of each object's proposals, mean over all chains and kept sweeps, `[N]`."""
-    states: list[KindState]
-    """Of some of the last sweeps, for what is learnt of the kinds."""
+    state: KindState
+    """After the last sweep: what is learnt of the kinds."""
 
 
 def run_kind_chains(
@@ -84,8 +80,7 @@ def run_kind_chains(
     if before_concentration is not None and not is_fixed:
         state.concentration[:] = before_concentration
     kept: dict[str, list] = {name: [] for name in KindDraws._fields[:6]}
-    accepted, states = np.zeros(data.num_objects), []
-    every = max(settings.num_samples // _NUM_STATES, 1)
+    accepted = np.zeros(data.num_objects)
     for number in range(settings.num_warmup + settings.num_samples):
         if settings.sampler == "sticks":
             state, share = sweep_sticks(
@@ -113,10 +108,8 @@ def run_kind_chains(
         )
         for name, value in zip(kept, values, strict=True):
             kept[name].append(value)
-        if (number - settings.num_warmup + 1) % every == 0:
-            states.append(compact(rng, data, state))
     stacked = {name: np.stack(values, axis=1) for name, values in kept.items()}
-    return KindDraws(**stacked, acceptance=accepted, states=states)
+    return KindDraws(**stacked, acceptance=accepted, state=compact(rng, data, state))
 
 
 def start_chains(

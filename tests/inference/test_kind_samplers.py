@@ -11,12 +11,14 @@ from scipy import special, stats
 from boomdp_jax.inference.kind_chains import KindSettings, run_kind_chains
 from boomdp_jax.inference.kind_coordinates import CoordinateModel
 from boomdp_jax.inference.kind_prior import KindPrior
-from boomdp_jax.inference.kind_state import KindData, log_joint
+from boomdp_jax.inference.kind_state import KindData, log_joint, no_tallies
 from boomdp_jax.inference.likelihood_bumps import bump_of_posterior, join_bumps
 from tests.inference.kind_problems import (
     NOISE,
+    SPREADS,
     STRUCTURE_PRIOR,
     STRUCTURES,
+    WEIGHTS,
     canonical,
     gaussian_problem,
     log_counts,
@@ -139,7 +141,7 @@ def test_bumps_that_are_off_do_not_bias_structures(sampled):
 
 def test_the_joint_density_of_a_state_is_the_product_of_its_parts(sampled):
     data, draws = sampled
-    state = draws.states[-1]
+    state = draws.state
     found = log_joint(data, state)
     for chain in range(3):
         partition = canonical(state.kind[chain])
@@ -328,3 +330,51 @@ def test_headings_that_meet_at_the_cut_are_taken_together(sampler):
         axis=1,
     )
     check_chain_means(found, np.array([same, moved]) / (same + other))
+
+
+BEFORE = (np.array([0.9, 1.0]), np.array([-1.0, -0.8, -0.9]))
+"""Exact coordinates of objects known before, kind by kind."""
+
+
+def log_known_and_read(known: np.ndarray, reading: float) -> float:
+    """Density of exact values and of a noisy one of the same kind, over spreads."""
+    n = len(known) + 1
+    noise = np.zeros(n)
+    noise[-1] = NOISE**2
+    each = []
+    for spread, weight in zip(SPREADS, WEIGHTS, strict=True):
+        covariance = spread**2 * np.eye(n) + (1 - spread**2) + np.diag(noise)
+        normal = stats.multivariate_normal(np.zeros(n), covariance)
+        each.append(np.log(weight) + normal.logpdf(np.append(known, reading)))
+    return float(np.logaddexp.reduce(each))
+
+
+@pytest.mark.parametrize("concentration", [CONCENTRATION, 0.0])
+def test_an_object_is_recognised_among_kinds_known_before(concentration):
+    reading, num_chains = 0.1, 64
+    # All have the first structure, in which only the first coordinate counts.
+    data = gaussian_problem(np.array([[reading, 0.0]]), np.array([[0.0, -60.0]]))
+    before = no_tallies(data, num_chains, 2)
+    for kind, values in enumerate(BEFORE):
+        before.count[:, kind] = len(values)
+        before.structure[:, kind, 0] = len(values)
+        before.num[:, kind, 0] = len(values)
+        before.first[:, kind, 0] = values.sum()
+        before.second[:, kind, 0] = (values**2).sum()
+    weight = []
+    for values in BEFORE:
+        structure = log_counts([0] * (len(values) + 1), 0.2 * STRUCTURE_PRIOR)
+        structure -= log_counts([0] * len(values), 0.2 * STRUCTURE_PRIOR)
+        both = log_known_and_read(values, reading) - log_group(values, 0.0)
+        weight.append(len(values) * np.exp(both + structure))
+    alone = np.exp(log_group(np.array([reading]), NOISE)) * STRUCTURE_PRIOR[0]
+    weight.append(concentration * alone)
+    exact = np.array(weight) / np.sum(weight)
+    settings = KindSettings(num_chains, 20, 200, concentration=concentration)
+    spread = data.coordinates.draw_spread(np.random.default_rng(7), (num_chains, 2))
+    draws = run_kind_chains(
+        np.random.default_rng(8), data, settings, before, spread.astype(int)
+    )
+    kind = np.minimum(draws.kind[..., 0], 2)
+    shares = np.stack([(kind == k).mean(1) for k in range(2)], axis=1)
+    check_chain_means(shares, exact[:2])
