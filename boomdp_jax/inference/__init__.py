@@ -4,6 +4,11 @@ from boomdp_jax.inference.fitted_kernel import structure_kernel as structure_ker
 from boomdp_jax.inference.infer import METHODS as METHODS
 from boomdp_jax.inference.infer import infer as infer
 from boomdp_jax.inference.infer import infer_batch as infer_batch
+from boomdp_jax.inference.kind_prior import KindPrior as KindPrior
+from boomdp_jax.inference.kinds import infer_kinds as infer_kinds
+from boomdp_jax.inference.kinds_file import LearntKinds as LearntKinds
+from boomdp_jax.inference.kinds_file import load_kinds as load_kinds
+from boomdp_jax.inference.kinds_posterior import KindsPosterior as KindsPosterior
 from boomdp_jax.inference.laplace_mixture import LaplaceMixture as LaplaceMixture
 from boomdp_jax.inference.numpyro_model import ObjectModel as ObjectModel
 from boomdp_jax.inference.numpyro_model import make_model as make_model
@@ -16,13 +21,18 @@ from boomdp_jax.inference.target import StructureTarget as StructureTarget
 
 __all__ = [
     "METHODS",
+    "KindPrior",
+    "KindsPosterior",
     "LaplaceMixture",
+    "LearntKinds",
     "ObjectModel",
     "Posterior",
     "StructureKernel",
     "StructureTarget",
     "infer",
     "infer_batch",
+    "infer_kinds",
+    "load_kinds",
     "load_posterior",
     "make_model",
     "predict",

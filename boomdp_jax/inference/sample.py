@@ -103,7 +103,7 @@ def sample_blocks(
         structure=structure,
         z=z,
         log_density=drawn.log_density.reshape(structure.shape),
-        noise_scale=_noise(noise_key, targets, structure, z),
+        noise_scale=draw_noise_scales(noise_key, targets, structure, z),
         log_evidence=drawn.evidence.total,
         evidence=drawn.evidence,
         diagnostics=drawn.diagnostics,
@@ -246,7 +246,7 @@ def _diagnose(
     return verdict._replace(ok=not reasons, reasons=reasons)
 
 
-def _noise(key: Key, targets: StructureTarget, structure, z) -> np.ndarray:
+def draw_noise_scales(key: Key, targets: StructureTarget, structure, z) -> np.ndarray:
     """Noise scales given every draw, from their inverse-gamma distribution."""
     num_objects, num_draws = structure.shape
     index = np.repeat(np.arange(num_objects), num_draws)

@@ -1,0 +1,377 @@
+"""Objects of a few kinds: pushing one tells of the others like it."""
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from boomdp_jax.core.arrays import Key, on_device
+from boomdp_jax.core.compile_time import CompileClock
+from boomdp_jax.core.history import History
+from boomdp_jax.inference.assemble import assemble_posterior
+from boomdp_jax.inference.chain_diagnostics import diagnose_chains
+from boomdp_jax.inference.coordinates import Coordinates
+from boomdp_jax.inference.evidence_report import BlockResult
+from boomdp_jax.inference.kind_chains import (
+    SAMPLERS,
+    KindDraws,
+    KindSettings,
+    run_kind_chains,
+)
+from boomdp_jax.inference.kind_features import number_labels, outline_features
+from boomdp_jax.inference.kind_objects import (
+    BodyAlone,
+    ObjectsAlone,
+    resting_pose,
+    sample_alone,
+)
+from boomdp_jax.inference.kind_prior import KindPrior, check_kind_prior
+from boomdp_jax.inference.kind_problem import kind_data, settle, structures_in_use
+from boomdp_jax.inference.kind_state import KindData, Tallies
+from boomdp_jax.inference.kinds_file import LearntKinds
+from boomdp_jax.inference.kinds_posterior import KindsPosterior
+from boomdp_jax.inference.noise import host_generator
+from boomdp_jax.inference.one_step import NOISE_SHAPE
+from boomdp_jax.inference.posterior import Posterior, library_versions
+from boomdp_jax.inference.sample import BlockDraws, draw_noise_scales
+from boomdp_jax.inference.structure_chain import ChainDraws
+from boomdp_jax.inference.structure_draws import SampleSettings
+from boomdp_jax.physics.scene_spec import SceneSpec
+
+# Draws that the posteriors keep, at most.
+_MOST_DRAWS = 2048
+
+
+def infer_kinds(
+    key: Key,
+    specs: SceneSpec | Sequence[SceneSpec],
+    histories: History | Sequence[History],
+    *,
+    prior_kinds: LearntKinds | None = None,
+    concentration: float | None = None,
+    use_labels: bool = True,
+    use_outlines: bool = True,
+    prior: KindPrior | None = None,
+    sampler: str = "collapsed",
+    num_chains: int = 32,
+    num_warmup: int = 60,
+    num_samples: int = 120,
+) -> KindsPosterior:
+    """Posteriors of all bodies together, objects of one kind being alike.
+
+    A Dirichlet-process mixture: bodies of one kind share which constraints they have
+    and, nearly, density, friction, wheels and places of pins on the body; how many
+    kinds there are is inferred. Labels and outlines are evidence of a body's kind, so
+    that what is learnt of some bodies is known of others that nobody has touched. With
+    one body it is the ordinary prior. Bodies are taken not to be tied to each other.
+
+    Prefer `infer` where objects have nothing in common, or are tied.
+
+    Args:
+        key: random key.
+        specs: the scene, or several whose bodies may have the same constraints.
+        histories: one for each scene. Bodies that rest and are not pushed tell nothing.
+        prior_kinds: kinds learnt before, `KindsPosterior.kinds` or `load_kinds`; each
+            chain takes one draw of them as it is, with what was prior to it.
+        concentration: how readily bodies are of new kinds; default: inferred. 0, with
+            `prior_kinds`: never, recognition among a fixed list.
+        use_labels: whether labels count.
+        use_outlines: whether outlines count.
+        prior: of kinds; not with `prior_kinds`, which bring theirs.
+        sampler: `collapsed` or `sticks`; see `collapsed_gibbs` and `stick_breaking`.
+        num_chains: chains, run side by side.
+        num_warmup: sweeps of each that are thrown away.
+        num_samples: sweeps of each that are kept.
+
+    Returns:
+        A posterior of each scene, and which bodies are of one kind.
+
+    Raises:
+        ValueError: a body tied to another, or with other possible constraints than the
+            first; kinds learnt of other ones; an option that makes no sense.
+    """
+    specs = [specs] if isinstance(specs, SceneSpec) else list(specs)
+    histories = [histories] if isinstance(histories, History) else list(histories)
+    _check_options(specs, histories, prior_kinds, concentration, sampler, prior)
+    if prior_kinds is not None:
+        prior = prior_kinds.prior
+        use_outlines = prior_kinds.num_features > 0 and use_outlines
+    prior = KindPrior() if prior is None else prior
+    start = time.perf_counter()
+    with CompileClock() as clock:
+        objects = sample_alone(
+            jax.random.fold_in(key, 0),
+            specs,
+            histories,
+            SampleSettings(),
+            reach=None if prior_kinds is None else prior_kinds.reach,
+        )
+        settings = KindSettings(
+            num_chains, num_warmup, num_samples, sampler, concentration=concentration
+        )
+        out = infer_kinds_of(
+            jax.random.fold_in(key, 1),
+            specs,
+            histories,
+            objects,
+            settings,
+            prior,
+            use_labels=use_labels,
+            use_outlines=use_outlines,
+            prior_kinds=prior_kinds,
+        )
+    wall = time.perf_counter() - start
+    seconds = {"compile": clock.seconds, "run": max(wall - clock.seconds, 0.0)}
+    for posterior in out.posteriors:
+        posterior.seconds.update(seconds)
+    return out
+
+
+def infer_kinds_of(
+    key: Key,
+    specs: Sequence[SceneSpec],
+    histories: Sequence[History],
+    objects: ObjectsAlone,
+    settings: KindSettings,
+    prior: KindPrior,
+    *,
+    use_labels: bool = True,
+    use_outlines: bool = True,
+    prior_kinds: LearntKinds | None = None,
+) -> KindsPosterior:
+    """The second stage alone, on bodies that were sampled by themselves.
+
+    Args:
+        key: random key.
+        specs: the scenes.
+        histories: one for each scene.
+        objects: of `sample_alone` on the same.
+        settings: how much to draw.
+        prior: of kinds.
+        use_labels: whether labels count.
+        use_outlines: whether outlines count.
+        prior_kinds: kinds learnt before.
+
+    Returns:
+        As `infer_kinds`.
+    """
+    specs_of = [specs[body.scene].bodies[body.body] for body in objects.bodies]
+    known = () if prior_kinds is None else prior_kinds.labels
+    labels = [body.label if use_labels else None for body in specs_of]
+    label, names = number_labels(labels, known)
+    features = np.stack([outline_features(body) for body in specs_of])
+    if not use_outlines:
+        features = features[:, :0]
+    data = kind_data(objects, label, len(names), features, prior)
+    rng = host_generator(jax.random.fold_in(key, 0))
+    before = {}
+    if prior_kinds is not None:
+        before = _before(prior_kinds, data, settings.num_chains)
+    draws = run_kind_chains(rng, data, settings, **before)
+    kept = np.arange(0, draws.kind.shape[1], _stride(draws))
+    has_before = prior_kinds is not None
+    posteriors = _posteriors(key, specs, histories, objects, draws, kept, has_before)
+    chains = draws.kind[:, kept].reshape(-1, data.num_objects)
+    layout = objects.bodies[0].block.layout
+    last = draws.state
+    return KindsPosterior(
+        posteriors=tuple(posteriors),
+        bodies=tuple((body.scene, body.name) for body in objects.bodies),
+        kind=chains,
+        concentration=draws.concentration[:, kept].reshape(-1),
+        acceptance=draws.acceptance,
+        kinds=LearntKinds(
+            tallies=last.tallies,
+            spread=last.spread.astype(np.int64),
+            concentration=last.concentration.copy(),
+            slots=tuple(slot.kind for slot in layout.slots + layout.known_slots),
+            labels=names,
+            num_features=features.shape[1],
+            reach=objects.reach,
+            prior=prior,
+            versions=library_versions(),
+        ),
+    )
+
+
+def _check_options(
+    specs, histories, prior_kinds, concentration, sampler, prior
+) -> None:
+    if len(specs) != len(histories):
+        raise ValueError(
+            f"histories: expected one per scene, {len(specs)}, got {len(histories)}"
+        )
+    for spec, history in zip(specs, histories, strict=True):
+        if history.num_bodies != spec.num_bodies:
+            raise ValueError(
+                f"{spec.source}: history: expected {spec.num_bodies} bodies, got "
+                f"{history.num_bodies}"
+            )
+    if sampler not in SAMPLERS:
+        raise ValueError(
+            f"sampler: expected one of {', '.join(SAMPLERS)}; got {sampler!r}"
+        )
+    if prior_kinds is not None and (sampler != "collapsed" or prior is not None):
+        raise ValueError(
+            "prior_kinds: expected the collapsed sampler and no other prior with it"
+        )
+    least = 0.0 if prior_kinds is not None else np.finfo(float).tiny
+    if concentration is not None and not least <= concentration < np.inf:
+        raise ValueError(
+            "concentration: expected a positive number, or 0 with prior_kinds; got "
+            f"{concentration!r}"
+        )
+    if prior is not None:
+        check_kind_prior(prior)
+
+
+def _before(prior_kinds: LearntKinds, data: KindData, num_chains: int) -> dict:
+    """Kinds known before for each chain, with room for labels that are new."""
+    tallies, num_features = prior_kinds.tallies, data.feature.shape[1]
+    shape = (
+        tallies.structure.shape[2],
+        tallies.num.shape[2] - prior_kinds.num_features,
+    )
+    if shape != (len(data.log_prior), data.dim):
+        raise ValueError(
+            f"prior_kinds: expected kinds of bodies that may have the same constraints "
+            f"({data.dim} coordinates), got {', '.join(prior_kinds.slots) or 'none'}"
+        )
+    chosen = np.arange(num_chains) % prior_kinds.num_draws
+    columns = data.dim + num_features
+    more = data.num_labels + 1 - tallies.label.shape[2]
+    label = tallies.label[chosen]
+    room = np.zeros((*label.shape[:2], more))
+    picked = Tallies(
+        count=tallies.count[chosen],
+        structure=tallies.structure[chosen],
+        label=np.concatenate([label[..., :-1], room, label[..., -1:]], axis=-1),
+        num=tallies.num[chosen][..., :columns],
+        first=tallies.first[chosen][..., :columns],
+        second=tallies.second[chosen][..., :columns],
+    )
+    return {
+        "before": picked,
+        "before_spread": prior_kinds.spread[chosen][..., :columns],
+        "before_concentration": np.maximum(prior_kinds.concentration[chosen], 1e-9),
+    }
+
+
+def _stride(draws: KindDraws) -> int:
+    num_chains, num_draws = draws.kind.shape[:2]
+    return max(1, -(-num_chains * num_draws // _MOST_DRAWS))
+
+
+def _posteriors(
+    key: Key,
+    specs,
+    histories,
+    objects: ObjectsAlone,
+    draws: KindDraws,
+    kept,
+    has_before: bool,
+) -> list[Posterior]:
+    """One posterior per scene, the same draws in all of them."""
+    num_chains = draws.kind.shape[0]
+    num_draws = num_chains * len(kept)
+    dtype = objects.bodies[0].block.target.log_prior.dtype
+    structure = draws.structure[:, kept].reshape(num_draws, -1)
+    z = draws.z[:, kept].reshape(num_draws, structure.shape[1], -1).astype(dtype)
+    log_joint = draws.log_joint[:, kept]
+    noise = _noise(jax.random.fold_in(key, 1), objects, structure, z)
+    ordered = np.sort(draws.kind[:, kept], axis=2)
+    num_kinds = 1.0 + np.sum(ordered[..., 1:] != ordered[..., :-1], axis=2)
+    concentration = np.maximum(draws.concentration[:, kept], 1e-300)
+    scalars = {
+        "num_kinds": on_device(num_kinds),
+        "log_concentration": on_device(np.log(concentration)),
+    }
+    results: list[list[BlockResult]] = [[] for _ in specs]
+    for i, body in enumerate(objects.bodies):
+        own = z[:, i]
+        target = body.block.target
+        if body.bumps is None:
+            spec, history = specs[body.scene], histories[body.scene]
+            pose = resting_pose(spec, history, body.body)
+            coordinates = _coordinates(body)
+            in_use = structures_in_use(body.block)[structure[:, i]]
+            own = np.where(in_use, settle(coordinates, own, pose), 0.0).astype(dtype)
+        shape = (num_chains, len(kept))
+        chains = ChainDraws(
+            on_device(structure[:, i].reshape(shape), int),
+            on_device(own.reshape(*shape, -1), dtype),
+            on_device(log_joint),
+        )
+        # Chains with kinds known before have different draws of them, and are not
+        # meant to agree.
+        most = np.inf if has_before else 1.05
+        verdict = diagnose_chains(target, chains, scalars=scalars, max_r_hat=most)
+        block_draws = BlockDraws(
+            structure=structure[None, :, i],
+            z=own[None],
+            log_density=np.zeros((1, num_draws)),
+            noise_scale=noise[i][None],
+            log_evidence=np.full(1, np.nan),
+            evidence=None,
+            diagnostics=[verdict],
+            chain_index=np.arange(num_chains),
+        )
+        results[body.scene].append(BlockResult(body.block, block_draws, 0))
+    posteriors = []
+    for scene, spec in enumerate(specs):
+        posterior = assemble_posterior(
+            jax.random.fold_in(key, 2 + scene),
+            spec,
+            results[scene],
+            seconds={},
+            notes=_notes(objects, scene),
+            method="kinds",
+        )
+        posteriors.append(
+            eqx.tree_at(
+                lambda p: p.log_density,
+                posterior,
+                on_device(log_joint.reshape(-1), posterior.log_density.dtype),
+            )
+        )
+    return posteriors
+
+
+def _notes(objects: ObjectsAlone, scene: int) -> list[str]:
+    notes = ["bodies are taken not to be tied to each other"]
+    at_rest = [b.name for b in objects.bodies if b.scene == scene and b.bumps is None]
+    if at_rest:
+        notes.append(
+            f"known by their kinds alone, never in motion: {', '.join(at_rest)}"
+        )
+    return notes
+
+
+def _noise(key: Key, objects: ObjectsAlone, structure, z) -> list[np.ndarray]:
+    """Noise scales given every draw, `[draw, 1, 4]` of each body."""
+    rng = host_generator(key)
+    out: list[np.ndarray] = []
+    for body in objects.bodies:
+        scale = np.asarray(_coordinates(body).scales.noise, float)
+        gamma = rng.gamma(NOISE_SHAPE, size=(len(structure), 1, 4))
+        out.append(scale / np.sqrt(gamma))
+    for batch, targets in enumerate(objects.targets):
+        members = [i for i, body in enumerate(objects.bodies) if body.batch == batch]
+        members.sort(key=lambda i: objects.bodies[i].place)
+        found = draw_noise_scales(
+            jax.random.fold_in(key, batch),
+            targets,
+            structure[:, members].T,
+            np.swapaxes(z[:, members], 0, 1),
+        )
+        for place, i in enumerate(members):
+            out[i] = found[place]
+    return out
+
+
+def _coordinates(body: BodyAlone) -> Coordinates:
+    likelihood: Any = body.block.target.log_likelihood
+    return likelihood.coordinates

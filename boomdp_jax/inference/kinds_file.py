@@ -1,0 +1,183 @@
+"""What was learnt of kinds of objects, and its file: a prior for rooms to come."""
+
+import dataclasses
+import json
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from boomdp_jax.core.npz_file import read_npz, write_npz
+from boomdp_jax.inference.kind_prior import KindPrior, check_kind_prior
+from boomdp_jax.inference.kind_state import Tallies
+
+SCHEMA = "boomdp-kinds-1"
+_MAX_HEADER_BYTES = 2**20
+_SHAPES = {
+    "count": (),
+    "structure": ("structure",),
+    "label": ("label",),
+    "num": ("coordinate",),
+    "first": ("coordinate",),
+    "second": ("coordinate",),
+    "spread": ("coordinate",),
+}
+"""Axes of each array after `[draw, kind]`."""
+_HEADER_FIELDS = {
+    "slots": list,
+    "labels": list,
+    "num_features": int,
+    "reach": (int, float),
+    "prior": dict,
+    "versions": dict,
+}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LearntKinds:
+    """Draws of what all objects of each kind add up to; `[draw, kind, ...]`.
+
+    Sums say all there is to know of a kind: its means, spreads and probabilities follow
+    from them in closed form. Which number a kind has differs from draw to draw and
+    means nothing.
+    """
+
+    tallies: Tallies
+    spread: np.ndarray
+    """Index of the spread of each coordinate."""
+    concentration: np.ndarray
+    """`[draw]`."""
+    slots: tuple[str, ...]
+    """Constraints that a body may have, in the order of its slots."""
+    labels: tuple[str, ...]
+    """Labels by number."""
+    num_features: int
+    """Features of outlines, the last coordinates; 0: outlines did not count."""
+    reach: float
+    """How far anchors may lie beyond an outline, in radii."""
+    prior: KindPrior
+    versions: dict[str, str]
+
+    @property
+    def num_draws(self) -> int:
+        """How many draws there are."""
+        return len(self.concentration)
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write an NPZ file with a JSON header that `load_kinds` reads.
+
+        Args:
+            path: the file; the whole of it or nothing is written.
+        """
+        header = {
+            "schema": SCHEMA,
+            "slots": list(self.slots),
+            "labels": list(self.labels),
+            "num_features": self.num_features,
+            "reach": self.reach,
+            "prior": self.prior._asdict(),
+            "versions": dict(self.versions),
+        }
+        text = json.dumps(header, allow_nan=False)
+        arrays = {"header": np.frombuffer(text.encode(), np.uint8)}
+        arrays |= self.tallies._asdict()
+        arrays |= {"spread": self.spread, "concentration": self.concentration}
+        write_npz(path, arrays)
+
+
+def load_kinds(path: str | os.PathLike) -> LearntKinds:
+    """Read what `LearntKinds.save` wrote.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The kinds, the same to the bit.
+
+    Raises:
+        ValueError: not such a file, a damaged one, another schema, or shapes that do
+            not fit together; one line.
+        OSError: the file cannot be opened.
+    """
+    arrays = read_npz(path)
+    header = _read_header(path, arrays.pop("header", None))
+    _check_arrays(path, arrays, header)
+    try:
+        fields: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in header["prior"].items()
+        }
+        prior = KindPrior(**fields)
+        check_kind_prior(prior)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: prior: {error}") from error
+    num_spreads = max(len(prior.spreads), len(prior.outline_spreads))
+    if arrays["spread"].min() < 0 or arrays["spread"].max() >= num_spreads:
+        raise ValueError(f"{path}: spread: expected indices under {num_spreads}")
+    return LearntKinds(
+        tallies=Tallies(**{name: arrays[name] for name in Tallies._fields}),
+        spread=arrays["spread"],
+        concentration=arrays["concentration"],
+        slots=tuple(header["slots"]),
+        labels=tuple(header["labels"]),
+        num_features=header["num_features"],
+        reach=float(header["reach"]),
+        prior=prior,
+        versions=header["versions"],
+    )
+
+
+def _read_header(path: str | os.PathLike, encoded: np.ndarray | None) -> dict:
+    if encoded is None or encoded.dtype != np.uint8 or encoded.ndim != 1:
+        raise ValueError(f"{path}: expected kinds with a header, got none")
+    if encoded.size > _MAX_HEADER_BYTES:
+        raise ValueError(
+            f"{path}: header: expected at most {_MAX_HEADER_BYTES} bytes, got "
+            f"{encoded.size}"
+        )
+    try:
+        header = json.loads(encoded.tobytes().decode())
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: header: expected JSON, got {error}") from error
+    schema = header.get("schema") if isinstance(header, dict) else None
+    if schema != SCHEMA:
+        raise ValueError(f"{path}: schema: expected {SCHEMA!r}, got {schema!r}")
+    for name, kind in _HEADER_FIELDS.items():
+        if not isinstance(header.get(name), kind):
+            raise ValueError(
+                f"{path}: header: expected a field {name!r} of the right kind, got "
+                f"{str(header.get(name))[:80]!r}"
+            )
+    return header
+
+
+def _check_arrays(
+    path: str | os.PathLike, arrays: Mapping[str, np.ndarray], header: dict
+) -> None:
+    """Compare names, kinds and shapes; an axis has one length in the whole file."""
+    expected: dict[str, tuple[str, ...]] = {
+        name: ("draw", "kind", *axes) for name, axes in _SHAPES.items()
+    }
+    expected["concentration"] = ("draw",)
+    if arrays.keys() != expected.keys():
+        odd = sorted(arrays.keys() ^ expected.keys())[0]
+        what = "is missing" if odd in expected else "is not known"
+        raise ValueError(f"{path}: {odd}: the array {what}")
+    lengths = {"label": len(header["labels"]) + 1}
+    for name, axes in expected.items():
+        array = arrays[name]
+        kind = "i" if name == "spread" else "f"
+        wanted = tuple(
+            lengths.setdefault(axis, size)
+            for axis, size in zip(axes, array.shape, strict=False)
+        )
+        if array.dtype.kind != kind or array.ndim != len(axes) or array.shape != wanted:
+            raise ValueError(
+                f"{path}: {name}: expected shape {list(axes)} with {lengths}, got "
+                f"{array.shape} of {array.dtype}"
+            )
+        if kind == "f" and not np.all(np.isfinite(array)):
+            raise ValueError(f"{path}: {name}: expected finite numbers")
+    if lengths["draw"] < 1:
+        raise ValueError(f"{path}: expected at least one draw, got none")

@@ -1,0 +1,193 @@
+r"""One object's kind, structure and coordinates, proposed together in every chain.
+
+Its coordinates are integrated out by bumps in place of its likelihood, so that an
+object which says little of a coordinate can change kinds whatever the tight kind that
+it leaves says of it. What is proposed is accepted by the true likelihood: with kinds c
+of weight w, the target is $w_c\,P(k|c)\,p(z|c)\,L(k, z)$ and the proposal, which
+does not depend on where the chain is, that with $\sum_m L_m$ in place of L (Neal
+(2000), Markov chain sampling methods for Dirichlet process mixture models, section 4;
+Metropolis-Hastings in place of Gibbs where L is no bump).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from boomdp_jax.inference.kind_coordinates import wrap
+from boomdp_jax.inference.likelihood_bumps import (
+    Bumps,
+    draw_product,
+    log_bump,
+    log_mass,
+    log_normal,
+    start_of_bumps,
+)
+
+
+class Kinds(NamedTuple):
+    """What every kind says of one object; `[chain, kind, ...]`."""
+
+    log_weight: np.ndarray
+    """Of the kind, labels and outlines included; need not be normalised."""
+    log_structure: np.ndarray
+    """`[chain, kind, K]`."""
+    mean: np.ndarray
+    """Of a normal distribution near the kind's coordinates, `[chain, kind, dim]`."""
+    variance: np.ndarray
+    log_exact: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    """Exact log-density of each coordinate, `[chain, dim]`, from a kind of each chain
+    and coordinates `[chain, dim]`."""
+
+
+class Choice(NamedTuple):
+    """A kind, a structure and coordinates in each chain; leading axis `chain`."""
+
+    kind: np.ndarray
+    structure: np.ndarray
+    z: np.ndarray
+    log_ratio: np.ndarray
+    """Log of target over proposal, the likelihood left out."""
+    is_inside: np.ndarray
+    """False where an angle fell outside of its cell; then the chain stays."""
+
+
+class ObjectMove:
+    """Proposals for one object, given what all kinds say of it."""
+
+    def __init__(
+        self, bumps: Bumps, in_use: np.ndarray, period: np.ndarray, kinds: Kinds
+    ):
+        """Weigh all kinds and bumps.
+
+        Args:
+            bumps: of the object.
+            in_use: coordinates that a structure uses, `[K, dim]`.
+            period: of angles, else 0, `[dim]`.
+            kinds: what they say.
+        """
+        self._bumps, self._in_use, self._period = bumps, in_use, period
+        self._log_exact = kinds.log_exact
+        # Of slots that nothing can go to there is nothing to work out.
+        pairs = np.nonzero(kinds.log_weight > -np.inf)
+        self._pair = np.zeros(kinds.log_weight.shape, int)
+        self._pair[pairs] = np.arange(len(pairs[0]))
+        self._variance = kinds.variance[pairs]
+        self._start = start_of_bumps(bumps, period, kinds.mean[pairs], self._variance)
+        mass, self._lower = log_mass(bumps, self._start, self._variance)
+        mass += kinds.log_structure[pairs][:, bumps.structure]
+        self._log_weight = np.full((*kinds.log_weight.shape, bumps.num), -np.inf)
+        self._log_weight[pairs] = mass + kinds.log_weight[pairs][:, None]
+
+    def draw(self, rng: np.random.Generator) -> Choice:
+        """Propose kind, structure and coordinates afresh."""
+        num_chains = len(self._log_weight)
+        flat = self._log_weight.reshape(num_chains, -1)
+        chosen = draw_index(rng, flat)
+        kind, bump = np.divmod(chosen, self._bumps.num)
+        return self._draw_from(rng, kind, bump)
+
+    def log_ratio(
+        self, kind: np.ndarray, structure: np.ndarray, z: np.ndarray
+    ) -> np.ndarray:
+        """Log of target over proposal at any point, the likelihood left out."""
+        pair = self._pair[np.arange(len(kind)), kind]
+        in_use = self._in_use[structure]
+        start, variance = self._start[pair], self._variance[pair]
+        offset = wrap(z[:, None, :] - self._bumps.centre, self._period)
+        density = log_normal(
+            offset, start, variance[:, None, :], in_use[:, None, :]
+        ) + log_bump(self._bumps, z, self._period)
+        density = np.where(
+            self._bumps.structure == structure[:, None], density, -np.inf
+        )
+        highest = density.max(axis=1)
+        proposal = highest + np.log(np.exp(density - highest[:, None]).sum(axis=1))
+        exact = self._log_exact(kind, z)
+        return np.sum(np.where(in_use, exact, 0.0), axis=1) - proposal
+
+    def nudge(
+        self,
+        rng: np.random.Generator,
+        kind: np.ndarray,
+        structure: np.ndarray,
+        z: np.ndarray,
+        share: float,
+    ) -> tuple[Choice, np.ndarray]:
+        """Propose coordinates near the old ones, kind and structure kept.
+
+        The autoregressive proposal that leaves one bump times the kind unchanged
+        (Cotter et al. (2013), MCMC methods for functions, section 4.2).
+
+        Args:
+            rng: source of randomness.
+            kind: of each chain.
+            structure: of each chain.
+            z: coordinates, `[chain, dim]`.
+            share: how far to move, in (0, 1]; 1 draws afresh.
+
+        Returns:
+            The proposal, and the log-ratio at the old point that belongs to it.
+        """
+        chains = np.arange(len(kind))
+        of_kind = self._log_weight[chains, kind]
+        is_same = self._bumps.structure == structure[:, None]
+        bump = draw_index(rng, np.where(is_same, of_kind, -np.inf))
+        offset = wrap(z - self._bumps.centre[bump], self._period)
+        mean = self._product(kind, bump, None)
+        fresh = self._product(kind, bump, rng)
+        new = mean + np.sqrt(1.0 - share**2) * (offset - mean) + share * (fresh - mean)
+        choice = self._choice(kind, bump, new, False)
+        before = self._one_bump_ratio(kind, bump, offset, z)
+        after = self._one_bump_ratio(kind, bump, new, choice.z)
+        return choice._replace(log_ratio=after), before
+
+    def _draw_from(self, rng, kind: np.ndarray, bump: np.ndarray) -> Choice:
+        return self._choice(kind, bump, self._product(kind, bump, rng), True)
+
+    def _product(self, kind, bump, rng) -> np.ndarray:
+        """A draw of bumps times kinds, or their means; relative to the centres."""
+        pair = self._pair[np.arange(len(kind)), kind]
+        residual = self._bumps.residual[bump]
+        start = self._start[pair, bump]
+        zero, none = np.zeros_like(start), np.zeros_like(residual)
+        return draw_product(
+            self._bumps.factor[bump],
+            residual,
+            self._lower[pair, bump],
+            start,
+            self._variance[pair],
+            zero if rng is None else rng.standard_normal(start.shape),
+            none if rng is None else rng.standard_normal(residual.shape),
+        )
+
+    def _choice(self, kind, bump, offset, with_ratio: bool) -> Choice:
+        structure = self._bumps.structure[bump]
+        in_use = self._in_use[structure]
+        is_angle = (self._period > 0) & in_use
+        is_inside = np.all(~is_angle | (2.0 * np.abs(offset) < self._period), axis=1)
+        z = wrap(self._bumps.centre[bump] + offset, self._period)
+        z = np.where(in_use, z, 0.0)
+        ratio = np.zeros(len(kind))
+        if with_ratio:
+            ratio = self.log_ratio(kind, structure, z)
+        return Choice(kind, structure, z, ratio, is_inside)
+
+    def _one_bump_ratio(self, kind, bump, offset, z) -> np.ndarray:
+        """Exact density over that of one bump times the kind's normal density."""
+        pair = self._pair[np.arange(len(kind)), kind]
+        in_use = self._in_use[self._bumps.structure[bump]]
+        start, variance = self._start[pair, bump], self._variance[pair]
+        normal = log_normal(offset, start, variance, in_use)
+        gap = np.einsum("pd,pdr->pr", offset, self._bumps.factor[bump])
+        gap -= self._bumps.residual[bump]
+        exact = np.where(in_use, self._log_exact(kind, z), 0.0).sum(axis=1)
+        return exact - normal + 0.5 * np.sum(gap**2, axis=1)
+
+
+def draw_index(rng: np.random.Generator, log_weight: np.ndarray) -> np.ndarray:
+    """An index of the last axis with probability in proportion to exp(log-weight)."""
+    weight = np.exp(log_weight - log_weight.max(axis=-1, keepdims=True))
+    cumulative = np.cumsum(weight, axis=-1)
+    level = (1.0 - rng.random(cumulative.shape[:-1])) * cumulative[..., -1]
+    return np.sum(cumulative < level[..., None], axis=-1)
