@@ -29,13 +29,13 @@ TARGET_SHARE, TARGET_ERROR = 0.99, 0.05
 
 
 def main() -> None:
-    parser = parser_of(__doc__, quick="6 objects, short chains")
+    parser = parser_of(__doc__, quick="3 objects")
     parser.add_argument("--objects", type=int, default=240, help="over all kinds")
     parser.add_argument("--batch", type=int, default=48, help="objects in one call")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     reporter = Reporter(arguments.out)
-    num = 6 if arguments.quick else arguments.objects
+    num = 3 if arguments.quick else arguments.objects
     objects = make_objects(num, arguments.seed)
     batch = min(num, arguments.batch)
     results, seconds = [], []
