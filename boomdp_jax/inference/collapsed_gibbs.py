@@ -12,6 +12,7 @@ objects say much: a new kind fits its first object.
 import numpy as np
 
 from boomdp_jax.inference.concentration import draw_concentration
+from boomdp_jax.inference.kind_shift import shift_kinds
 from boomdp_jax.inference.kind_state import (
     KindData,
     KindState,
@@ -25,6 +26,8 @@ from boomdp_jax.inference.object_moves import Kinds, ObjectMove, draw_index
 
 # A nudge every so often, and how far it goes.
 _NUDGE_EVERY, _NUDGE_SHARE = 3, 0.4
+# Common shifts of all objects of a kind in each sweep.
+_NUM_SHIFTS = 2
 
 
 def sweep_collapsed(
@@ -48,6 +51,8 @@ def sweep_collapsed(
         The new state, and the share of chains that accepted, `[N]`.
     """
     state = compact(rng, data, state)
+    for _ in range(_NUM_SHIFTS):
+        state = shift_kinds(rng, data, state)
     draw_spreads(rng, data, state)
     accepted = np.ones(data.num_objects)
     is_nudge = number % _NUDGE_EVERY == _NUDGE_EVERY - 1

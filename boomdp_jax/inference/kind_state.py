@@ -200,13 +200,21 @@ def log_joint(data: KindData, state: KindState) -> np.ndarray:
     base = prior.structure_weight * np.exp(data.log_prior)
     out += _log_dirichlet(tallies.structure, before.structure, base)
     out += _log_dirichlet(tallies.label, before.label, label_base(data))
-    each = _log_coordinates(data, tallies)
-    each[:, :num_before] -= _log_coordinates(data, before)
+    each = log_coordinates(data, tallies)
+    each[:, :num_before] -= log_coordinates(data, before)
     return out + each.sum(axis=1)
 
 
-def _log_coordinates(data: KindData, tallies: Tallies) -> np.ndarray:
-    """Of the coordinates of each kind, `[chain, kind]`."""
+def log_coordinates(data: KindData, tallies: Tallies) -> np.ndarray:
+    """Log-density of each kind's coordinates, spreads too integrated out.
+
+    Args:
+        data: what is known of the objects.
+        tallies: of the kinds.
+
+    Returns:
+        One number for each, `[chain, kind]`.
+    """
     model = data.coordinates
     each = model.log_marginal(tallies.num, tallies.first, tallies.second)
     each = each + model.log_weight
