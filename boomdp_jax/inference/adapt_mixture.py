@@ -31,12 +31,19 @@ from boomdp_jax.inference.walker_moves import (
 from boomdp_jax.inference.weighing import refine, weigh
 
 # Rounds end where every structure of such a probability has this many effective draws.
-_MATTERS, _ENOUGH, _MAX_ROUNDS = 0.01, 300.0, 6
+_MATTERS, _ENOUGH = 0.01, 300.0
 _NUM_WALKERS, _NUM_WALKS = 512, 6
 # A structure gets walkers if its probability is above this; half of them are spread
 # evenly over all that do.
 _LEAST_PROBABILITY, _EVEN_SHARE = 1e-8, 0.5
 _WALK_STEP, _WALK_ACCEPT = 0.5, 0.4
+
+
+class Adapted(NamedTuple):
+    """Mixtures, and weighted draws of ones hardly different."""
+
+    mixtures: LaplaceMixture
+    evidence: ImportanceEvidence
 
 
 class Walked(NamedTuple):
@@ -53,7 +60,9 @@ def adapt_mixtures(
     mixtures: LaplaceMixture,
     num_draws: int,
     evaluate: Callable[..., Array],
-) -> LaplaceMixture:
+    *,
+    max_rounds: int = 6,
+) -> Adapted:
     """Adapt mixtures to their posteriors, in rounds.
 
     Args:
@@ -62,24 +71,25 @@ def adapt_mixtures(
         mixtures: one of each object, with spare components.
         num_draws: of each round and object.
         evaluate: log-densities of as many points of every object.
+        max_rounds: rounds of walks, at least 1; fewer where draws are enough.
 
     Returns:
         Mixtures with other weights and, where walkers were enough, with a component
-        for each structure fitted to them. What is drawn from them next does not depend
-        on the draws of the rounds but through the mixtures.
+        for each structure fitted to them; and the last round's weighted draws, from
+        mixtures that did not depend on them.
     """
-    points = None
-    for _ in range(_MAX_ROUNDS):
-        found = weigh(rng, targets, mixtures, num_draws, evaluate)
-        mixtures = refine(targets, mixtures, found)
-        if points is not None and _is_enough(found):
-            break
-        if points is None:
-            points = _walkers(rng, found, targets, mixtures)
+    found = weigh(rng, targets, mixtures, num_draws, evaluate)
+    mixtures = refine(targets, mixtures, found)
+    points = _walkers(rng, found, targets, mixtures)
+    for _ in range(max_rounds):
         points = walk(rng, points, targets, mixtures, evaluate, _NUM_WALKS).points
         places = np.asarray(points.structure), np.asarray(points.z)
         mixtures = fit_spare(targets, mixtures, *places)
-    return mixtures
+        found = weigh(rng, targets, mixtures, num_draws, evaluate)
+        mixtures = refine(targets, mixtures, found)
+        if _is_enough(found):
+            break
+    return Adapted(mixtures, found)
 
 
 def walk(

@@ -19,8 +19,9 @@ from boomdp_jax.inference.walker_moves import log_proposal_of
 
 # Structures of such a probability, with as many draws of both kinds, get a bridge.
 _MATTERS, _LEAST_DRAWS = 0.005, 20
-# A gap counts from so many errors, and nats; an error of so many nats is too large.
-_NUM_ERRORS, _LEAST_NATS, _MOST_ERROR = 5.0, 0.2, 0.25
+# A gap counts from so many errors, and nats. Errors of a probability, and of the whole
+# evidence in nats, that are too large.
+_NUM_ERRORS, _LEAST_NATS, _MOST_DOUBT, _MOST_NATS = 5.0, 0.2, 0.05, 0.5
 
 
 class Bridged(NamedTuple):
@@ -76,14 +77,18 @@ def bridge_structures(
                 )
             log_evidence[i, k], error[i, k] = value, bridge.error
     evidence = _odds(log_evidence, error, log_prior)
-    for i, k in zip(*np.nonzero(evidence.probability > _MATTERS), strict=True):
-        # What is nearly certain is as likely, however well its evidence is known.
-        doubt = error[i, k] * (1.0 - evidence.probability[i, k])
-        if not max(doubt, evidence.total_error[i] / 2.0) <= _MOST_ERROR:
-            reasons[i].append(
-                f"log-evidence of a structure of probability "
-                f"{evidence.probability[i, k]:.2f}: standard error is "
-                f"{error[i, k]:.2f}, above {_MOST_ERROR}"
+    for i, mine in enumerate(reasons):
+        worst = int(np.argmax(evidence.probability_error[i]))
+        if not evidence.probability_error[i, worst] <= _MOST_DOUBT:
+            mine.append(
+                f"probability {evidence.probability[i, worst]:.2f} of a structure: "
+                f"standard error is {evidence.probability_error[i, worst]:.2f}, above "
+                f"{_MOST_DOUBT}"
+            )
+        if not evidence.total_error[i] <= _MOST_NATS:
+            mine.append(
+                f"log-evidence: standard error is {evidence.total_error[i]:.2f}, above "
+                f"{_MOST_NATS}"
             )
     return Bridged(evidence, reasons)
 

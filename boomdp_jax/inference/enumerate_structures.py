@@ -69,7 +69,7 @@ def enumerate_structures(
     rng = host_generator(key)
     mixtures = start_mixtures(targets, modes)
     size = settings.num_importance
-    mixtures = adapt_mixtures(rng, targets, mixtures, size, evaluate)
+    mixtures = adapt_mixtures(rng, targets, mixtures, size, evaluate).mixtures
     found = weigh(rng, targets, mixtures, _LAST_ROUND * size, evaluate)
     points = resample_walkers(
         found, targets, mixtures, settings.num_chains, settings.num_samples

@@ -1,8 +1,8 @@
 """From a target to the mixture that its jumps are drawn from, and the structures' odds.
 
 Every structure is fitted from many starts; its modes become Laplace components, the
-structures with one slot less and the prior fill the gaps, and importance sampling sets
-the weights.
+structures with one slot less and the prior fill the gaps, and walkers and importance
+sampling set the weights.
 """
 
 from typing import NamedTuple
@@ -10,13 +10,15 @@ from typing import NamedTuple
 import jax
 
 from boomdp_jax.core.arrays import Key
+from boomdp_jax.inference.adapt_mixture import adapt_mixtures
 from boomdp_jax.inference.find_modes import find_modes
 from boomdp_jax.inference.fit import FitSettings
 from boomdp_jax.inference.importance_evidence import ImportanceEvidence
 from boomdp_jax.inference.laplace_mixture import LaplaceMixture
+from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.structure_draws import start_mixtures
 from boomdp_jax.inference.target import StructureTarget
-from boomdp_jax.inference.weighing import weigh_mixtures
+from boomdp_jax.inference.weighing import evaluate_each
 
 
 class FittedMixture(NamedTuple):
@@ -51,8 +53,12 @@ def fitted_mixture(
     settings = FitSettings() if settings is None else settings
     found = find_modes(fit_key, stacked, settings)
     mixtures = start_mixtures(found.targets, found.modes)
-    mixtures, evidence = weigh_mixtures(
-        importance_key, found.targets, mixtures, num_importance
+    mixtures, evidence = adapt_mixtures(
+        host_generator(importance_key),
+        found.targets,
+        mixtures,
+        num_importance,
+        evaluate_each,
     )
     every = FittedMixture(found.targets, mixtures, evidence)
     return jax.tree.map(lambda leaf: leaf[0], every)

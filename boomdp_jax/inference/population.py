@@ -19,9 +19,8 @@ import numpy as np
 from jaxtyping import Array
 
 from boomdp_jax.core.arrays import Key, on_device
-from boomdp_jax.inference.importance_evidence import (
-    ImportanceEvidence,
-)
+from boomdp_jax.inference.adapt_mixture import adapt_mixtures
+from boomdp_jax.inference.importance_evidence import ImportanceEvidence
 from boomdp_jax.inference.laplace_mixture import LaplaceMixture
 from boomdp_jax.inference.moves import Point
 from boomdp_jax.inference.noise import host_generator
@@ -37,7 +36,7 @@ from boomdp_jax.inference.walker_moves import (
     no_moves,
     propose_all,
 )
-from boomdp_jax.inference.weighing import evaluate_each, weigh_twice
+from boomdp_jax.inference.weighing import evaluate_each
 
 # Moves of one sweep, by name.
 _CYCLE = ("jump", "walk", "change", "walk", "jump")
@@ -55,7 +54,7 @@ class PopulationSettings(NamedTuple):
     num_sweeps: int = 8
     """Sweeps that are kept; each gives one draw per walker."""
     num_importance: int = 2048
-    """Draws from the mixture that refine its weights; and again, that are weighed."""
+    """Draws of each round that adapts the mixture; the last ones are the evidence."""
     max_doublings: int = 2
     """How often the number of sweeps may double, of which then every second is kept,
     where the chains do not agree yet."""
@@ -97,7 +96,7 @@ def sample_population(
     """
     evaluate = evaluate_each if evaluate is None else evaluate
     rng = host_generator(key)
-    mixtures, evidence = weigh_twice(
+    mixtures, evidence = adapt_mixtures(
         rng, targets, mixtures, settings.num_importance, evaluate
     )
     points = resample_walkers(

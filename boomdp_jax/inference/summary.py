@@ -92,6 +92,11 @@ def summarise(
             columns.append(
                 {**_statistics(value, weights, one_scale), "identified": True}
             )
+        elif len(value) == 1:
+            # A single hypothesis says what it is, and nothing of what is known.
+            columns.append(
+                {**_statistics(value, weights, one_scale), "identified": False}
+            )
         elif _is_identified(value, weights, reference, equal, one_scale):
             columns.append(
                 {**_statistics(value, weights, one_scale), "identified": True}

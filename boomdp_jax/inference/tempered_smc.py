@@ -53,7 +53,7 @@ from boomdp_jax.inference.walker_moves import (
     no_moves,
     propose_all,
 )
-from boomdp_jax.inference.weighing import batch_noise, evaluate_each, weigh
+from boomdp_jax.inference.weighing import batch_noise, evaluate_each
 
 _NUM_ISLANDS = 16
 # Share of the particles that the weights of one step must count for.
@@ -102,9 +102,8 @@ def sample_tempered(
     rng = host_generator(key)
     mixtures = start_mixtures(targets, modes)
     size = settings.num_importance
-    mixtures = adapt_mixtures(rng, targets, mixtures, size, evaluate)
+    mixtures, found = adapt_mixtures(rng, targets, mixtures, size, evaluate)
     mixtures = _spread(targets, mixtures)
-    found = weigh(rng, targets, mixtures, size, evaluate)
     num_particles = -(-settings.num_chains * settings.num_samples // _NUM_ISLANDS)
     particles = _start(rng, targets, mixtures, num_particles * _NUM_ISLANDS, evaluate)
     num_objects, num_structures = targets.structures.shape[:2]

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from boomdp_jax.core.arrays import Key, on_device
+from boomdp_jax.core.arrays import on_device
 from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.inference.evaluate import evaluate_points
 from boomdp_jax.inference.importance_evidence import (
@@ -16,38 +16,12 @@ from boomdp_jax.inference.importance_evidence import (
 )
 from boomdp_jax.inference.laplace_mixture import LaplaceMixture
 from boomdp_jax.inference.mixture_building import refine_weights
-from boomdp_jax.inference.noise import Noise, host_generator, host_noise
+from boomdp_jax.inference.noise import Noise, host_noise
 from boomdp_jax.inference.target import StructureTarget
 
-
-def weigh_mixtures(
-    key: Key, targets: StructureTarget, mixtures: LaplaceMixture, num_draws: int
-) -> tuple[LaplaceMixture, ImportanceEvidence]:
-    """Set weights of mixtures by importance sampling, and weigh structures with them.
-
-    Args:
-        key: random key.
-        targets: with a `FilteredLikelihood`, stacked along a leading object axis.
-        mixtures: one of each object.
-        num_draws: for the weights, and as many again for the evidence.
-
-    Returns:
-        Mixtures with other weights, and the evidence of every object.
-    """
-    return weigh_twice(host_generator(key), targets, mixtures, num_draws, evaluate_each)
-
-
-def weigh_twice(
-    rng: np.random.Generator,
-    targets: StructureTarget,
-    mixtures: LaplaceMixture,
-    num_draws: int,
-    evaluate: Callable[..., Array],
-) -> tuple[LaplaceMixture, ImportanceEvidence]:
-    """The same with another source of randomness and of log-densities."""
-    evidence = weigh(rng, targets, mixtures, num_draws, evaluate)
-    mixtures = refine(targets, mixtures, evidence)
-    return mixtures, weigh(rng, targets, mixtures, num_draws, evaluate)
+# Share of the weight that stays spread evenly, over components of modes times priors as
+# well: what draws have missed so far must be found by others.
+_FLOOR = 0.3
 
 
 @QuickCompile
@@ -114,7 +88,9 @@ def evaluate_each(
 @QuickCompile
 def _refine_all(targets: StructureTarget, mixtures: LaplaceMixture, evidence):
     return jax.vmap(
-        lambda t, m, e: refine_weights(t, m, e.structure, e.z, e.log_weight)
+        lambda t, m, e: refine_weights(
+            t, m, e.structure, e.z, e.log_weight, floor=_FLOOR
+        )
     )(targets, mixtures, evidence)
 
 

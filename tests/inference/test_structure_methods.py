@@ -23,7 +23,8 @@ from tests.inference.linear_gaussian import (
 FALSE_ALARM = 1e-4
 SEEDS = (0, 1)
 SETTINGS = SampleSettings(num_chains=4, num_warmup=64, num_samples=500)
-WITH_ERRORS = ("rj", "enumerate", "smc")
+# Jumps compile longest, and have slow tests of their own.
+WITH_ERRORS = (pytest.param("rj", marks=pytest.mark.slow), "enumerate", "smc")
 
 
 @jax.jit

@@ -128,3 +128,11 @@ def test_infinite_limits_become_null():
 def test_plain_leaves_only_what_json_knows():
     value = {"a": np.float32("nan"), "b": [np.int64(3), np.array([1.0, np.inf])]}
     assert plain(value) == {"a": None, "b": [3, [1.0, None]]}
+
+
+def test_a_single_hypothesis_says_what_it_is_and_counts_as_unidentified():
+    prior = np.random.default_rng(0).normal(size=1000)
+    found = summarise(np.array([2.5]), np.ones(1), prior)
+    assert not found["identified"]
+    assert [found[name] for name in ("mean", "q05", "q50", "q95")] == [2.5] * 4
+    assert found["sd"] == 0.0
