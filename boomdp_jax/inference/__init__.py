@@ -4,6 +4,12 @@ from boomdp_jax.inference.fitted_kernel import structure_kernel as structure_ker
 from boomdp_jax.inference.infer import METHODS as METHODS
 from boomdp_jax.inference.infer import infer as infer
 from boomdp_jax.inference.infer import infer_batch as infer_batch
+from boomdp_jax.inference.informative_wrench import (
+    InformationGain as InformationGain,
+)
+from boomdp_jax.inference.informative_wrench import (
+    informative_wrench as informative_wrench,
+)
 from boomdp_jax.inference.kind_prior import KindPrior as KindPrior
 from boomdp_jax.inference.kinds import infer_kinds as infer_kinds
 from boomdp_jax.inference.kinds_file import LearntKinds as LearntKinds
@@ -21,6 +27,7 @@ from boomdp_jax.inference.target import StructureTarget as StructureTarget
 
 __all__ = [
     "METHODS",
+    "InformationGain",
     "KindPrior",
     "KindsPosterior",
     "LaplaceMixture",
@@ -32,6 +39,7 @@ __all__ = [
     "infer",
     "infer_batch",
     "infer_kinds",
+    "informative_wrench",
     "load_kinds",
     "load_posterior",
     "make_model",
