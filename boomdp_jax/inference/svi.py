@@ -240,7 +240,7 @@ def _fit(
 
     state, _ = jax.lax.scan(advance, state, None, length=num_steps)
     posterior: Any = guide.get_posterior(svi.get_params(state))
-    flat = posterior.sample(draw_key, (num_draws,))
+    flat = jax.vmap(posterior.sample)(jax.random.split(draw_key, num_draws))
 
     def weigh(number: Array) -> tuple[Array, Array]:
         log_density = -potential_energy(model, (), {}, unpack(number))
