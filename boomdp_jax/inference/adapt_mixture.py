@@ -47,11 +47,10 @@ class Adapted(NamedTuple):
 
 
 class Walked(NamedTuple):
-    """Where walkers ended, how their moves went, and the step sizes they learnt."""
+    """Where walkers ended, and how their moves went."""
 
     points: Point
     counts: MoveCounts
-    step_size: np.ndarray
 
 
 def adapt_mixtures(
@@ -121,7 +120,7 @@ def walk(
         count_moves(counts, "walk", info)
         rate = np.mean(np.asarray(info.accept_probability, float), axis=1)
         step_size = np.clip(step_size * np.exp(rate - _WALK_ACCEPT), 0.02, 0.98)
-    return Walked(points, counts, step_size)
+    return Walked(points, counts)
 
 
 def _is_enough(evidence: ImportanceEvidence) -> bool:

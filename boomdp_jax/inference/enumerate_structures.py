@@ -77,7 +77,7 @@ def enumerate_structures(
     # Few effective draws are repeated often, and have to walk apart.
     least_size = float(np.asarray(found.effective_sample_size).min())
     num_walks = _NUM_WALKS[int(least_size < _GOOD_SHARE * size)]
-    points, counts, _ = walk(rng, points, targets, mixtures, evaluate, num_walks)
+    points, counts = walk(rng, points, targets, mixtures, evaluate, num_walks)
     bridged = bridge_structures(targets, mixtures, found, points, settings.num_chains)
     draws = _in_chains(rng, points, bridged.evidence.probability, settings.num_chains)
     verdicts = []

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from boomdp_jax.core.json_header import read_json_header
 from boomdp_jax.core.npz_file import read_npz, write_npz
 from boomdp_jax.inference.kind_prior import KindPrior, check_kind_prior
 from boomdp_jax.inference.kind_state import Tallies
@@ -101,7 +102,14 @@ def load_kinds(path: str | os.PathLike) -> LearntKinds:
         OSError: the file cannot be opened.
     """
     arrays = read_npz(path)
-    header = _read_header(path, arrays.pop("header", None))
+    header = read_json_header(
+        path,
+        arrays.pop("header", None),
+        what="kinds",
+        schema=SCHEMA,
+        fields=_HEADER_FIELDS,
+        max_bytes=_MAX_HEADER_BYTES,
+    )
     _check_arrays(path, arrays, header)
     try:
         fields: dict[str, Any] = {
@@ -126,30 +134,6 @@ def load_kinds(path: str | os.PathLike) -> LearntKinds:
         prior=prior,
         versions=header["versions"],
     )
-
-
-def _read_header(path: str | os.PathLike, encoded: np.ndarray | None) -> dict:
-    if encoded is None or encoded.dtype != np.uint8 or encoded.ndim != 1:
-        raise ValueError(f"{path}: expected kinds with a header, got none")
-    if encoded.size > _MAX_HEADER_BYTES:
-        raise ValueError(
-            f"{path}: header: expected at most {_MAX_HEADER_BYTES} bytes, got "
-            f"{encoded.size}"
-        )
-    try:
-        header = json.loads(encoded.tobytes().decode())
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: header: expected JSON, got {error}") from error
-    schema = header.get("schema") if isinstance(header, dict) else None
-    if schema != SCHEMA:
-        raise ValueError(f"{path}: schema: expected {SCHEMA!r}, got {schema!r}")
-    for name, kind in _HEADER_FIELDS.items():
-        if not isinstance(header.get(name), kind):
-            raise ValueError(
-                f"{path}: header: expected a field {name!r} of the right kind, got "
-                f"{str(header.get(name))[:80]!r}"
-            )
-    return header
 
 
 def _check_arrays(

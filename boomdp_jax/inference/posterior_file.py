@@ -9,6 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from boomdp_jax.core.json_header import read_json_header
 from boomdp_jax.core.npz_file import read_npz, write_npz
 from boomdp_jax.physics.params import (
     Distance,
@@ -122,7 +123,14 @@ def read_posterior_file(
         OSError: the file cannot be opened.
     """
     arrays = read_npz(path)
-    header = _read_header(path, arrays.pop("header", None))
+    header = read_json_header(
+        path,
+        arrays.pop("header", None),
+        what="a posterior",
+        schema=SCHEMA,
+        fields=_HEADER_FIELDS,
+        max_bytes=MAX_HEADER_BYTES,
+    )
     expected = _expected_shapes(arrays)
     _check_arrays(path, arrays, expected)
     params = _unflatten("params", arrays)
@@ -163,31 +171,6 @@ def _unflatten(prefix: str, arrays: Mapping[str, np.ndarray]) -> Params:
 def _has(group: str, arrays: Mapping[str, np.ndarray]) -> bool:
     """Whether a file has a group, or must have it."""
     return group not in _OPTIONAL or f"inferred.{group}" in arrays
-
-
-def _read_header(path: str | os.PathLike, encoded: np.ndarray | None) -> dict:
-    """Decode the JSON header and check its fields."""
-    if encoded is None or encoded.dtype != np.uint8 or encoded.ndim != 1:
-        raise ValueError(f"{path}: expected a posterior with a header, got none")
-    if encoded.size > MAX_HEADER_BYTES:
-        raise ValueError(
-            f"{path}: header: expected at most {MAX_HEADER_BYTES} bytes, got "
-            f"{encoded.size}"
-        )
-    try:
-        header = json.loads(encoded.tobytes().decode())
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: header: expected JSON, got {error}") from error
-    schema = header.get("schema") if isinstance(header, dict) else None
-    if schema != SCHEMA:
-        raise ValueError(f"{path}: schema: expected {SCHEMA!r}, got {schema!r}")
-    for name, kind in _HEADER_FIELDS.items():
-        if name not in header or not isinstance(header[name], kind):
-            raise ValueError(
-                f"{path}: header: expected a field {name!r} of the right kind, got "
-                f"{str(header.get(name))[:80]!r}"
-            )
-    return header
 
 
 def _expected_shapes(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple]:
