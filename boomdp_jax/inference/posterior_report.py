@@ -29,7 +29,7 @@ _TITLES = {
     "anchor_b": "anchor on b",
     "length": "length",
     "axis": "axis",
-    "angle": "angle of a against b",
+    "angle": "angle against b",
     "pose": "place and heading",
     "along_axle": "along its axle",
     "across_axle": "across its axle",
