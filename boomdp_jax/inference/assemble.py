@@ -10,7 +10,7 @@ from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.evidence_report import BlockResult, report_evidence
 from boomdp_jax.inference.noise import host_generator
-from boomdp_jax.inference.one_step import NOISE_SHAPE
+from boomdp_jax.inference.noise_level import prior_noise
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.physics.constraint_spec import JOINTS, KINDS
 from boomdp_jax.physics.params import WORLD, Params, empty_params
@@ -66,6 +66,7 @@ def assemble_posterior(
     """
     num_chains = max((len(r.draws.chain_index) for r in results), default=1)
     posterior_parts, prior_parts, noise_parts, prior_noise_parts = [], [], [], []
+    impulse_parts, prior_impulse_parts = [], []
     for number, result in enumerate(results):
         block, draws, place = result
         target = block.target
@@ -78,17 +79,23 @@ def assemble_posterior(
         every = np.ones((NUM_PRIOR_DRAWS, target.structures.shape[1]), bool)
         prior_parts.append(_decode(coordinates, z, every))
         noise_parts.append(draws.noise_scale[place])
-        shape = (NUM_PRIOR_DRAWS, len(block.bodies), 4)
-        scale = np.asarray(coordinates.scales.noise)
-        prior_noise_parts.append(scale / np.sqrt(rng.gamma(NOISE_SHAPE, size=shape)))
+        impulse_parts.append(
+            None if draws.impulse_scale is None else draws.impulse_scale[place]
+        )
+        shape = (NUM_PRIOR_DRAWS, len(block.bodies))
+        scale = np.asarray(coordinates.scales.noise, float)
+        reading, impulse = prior_noise(rng, scale, shape)
+        prior_noise_parts.append(reading)
+        prior_impulse_parts.append(impulse)
     blocks = [r.block for r in results]
     params, inferred = _merge(spec, blocks, posterior_parts)
     prior_params, _ = _merge(spec, blocks, prior_parts)
     num_draws = params.density.shape[0]
+    has_impulses = all(part is not None for part in impulse_parts)
     chain = results[0].draws.chain_index if results else np.arange(num_chains)
     return Posterior(
         params=params,
-        noise_scale=_merge_noise(spec, blocks, noise_parts, num_draws),
+        noise_scale=_merge_noise(spec, blocks, noise_parts, num_draws, 4),
         log_weight=on_device(np.full(num_draws, -np.log(num_draws))),
         log_density=on_device(
             sum(
@@ -99,13 +106,21 @@ def assemble_posterior(
         chain=on_device(chain.repeat(num_draws // len(chain)), int),
         prior_params=prior_params,
         prior_noise_scale=_merge_noise(
-            spec, blocks, prior_noise_parts, prior_params.density.shape[0]
+            spec, blocks, prior_noise_parts, prior_params.density.shape[0], 4
         ),
         inferred=inferred,
         spec=spec,
         log_evidence=sum((float(r.draws.log_evidence[r.place]) for r in results), 0.0),
         diagnostics=_diagnostics(spec, results, notes, method)
         | report_evidence(spec, results),
+        impulse_scale=_merge_noise(spec, blocks, impulse_parts, num_draws, 2)
+        if has_impulses
+        else None,
+        prior_impulse_scale=_merge_noise(
+            spec, blocks, prior_impulse_parts, prior_params.density.shape[0], 2
+        )
+        if has_impulses
+        else None,
         seconds=seconds,
     )
 
@@ -205,8 +220,11 @@ def _merge(
     return params, inferred
 
 
-def _merge_noise(spec: SceneSpec, blocks: list[Block], parts: list, num_draws: int):
-    out = np.ones((num_draws, spec.num_bodies, 4))
+def _merge_noise(
+    spec: SceneSpec, blocks: list[Block], parts: list, num_draws: int, num: int
+):
+    """Noise of all bodies, `num` of each; one where a body is in no block."""
+    out = np.ones((num_draws, spec.num_bodies, num))
     for block, part in zip(blocks, parts, strict=True):
         out[:, np.asarray(block.bodies)] = np.asarray(part)
     return on_device(out)

@@ -74,7 +74,7 @@ def make_block(spec: SceneSpec, bodies: tuple[int, ...], history: History) -> Bl
                 ),
                 gains,
             ),
-            reference=on_device(reference),
+            reference=on_device(np.tile(reference[None], (len(rows), 1, 1))),
         ),
         structures=on_device(rows, bool),
         log_prior=on_device(log_prior),

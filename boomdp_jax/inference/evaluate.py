@@ -1,27 +1,25 @@
 """Likelihoods of many points of many objects, by one compiled program.
 
 Points come as a flat list on the host. They are sorted into chunks of equal object and
-structure, so that data and gains are read once for a chunk and products with gains
-vectorise, and handed out in calls of one size, as many at a time as there are cores:
-whatever is fitted, weighed or sampled, and however many objects there are, the physics
-is compiled once.
+structure (`chunking`), so that data and gains are read once for a chunk and products
+with gains vectorise, and handed out in calls of one size, as many at a time as there
+are cores: whatever is fitted, weighed or sampled, and however many objects there are,
+the physics is compiled once.
 """
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import on_device
 from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.core.side_by_side import call_each
+from boomdp_jax.inference.chunking import Chunking
+from boomdp_jax.inference.filtered_likelihood import without_gains
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.tracking import Gains
-
-_CHUNK = 32
-_CHUNKS_PER_CALL = 4
 
 
 class Evaluation(NamedTuple):
@@ -42,6 +40,7 @@ class _Chunks(NamedTuple):
     likelihood: Any
     """Without structures and gains, whose shapes depend on the number of structures."""
     gains: Gains
+    reference: Float[Array, "chunk body 4"]
     active: Bool[Array, "chunk slot"]
 
 
@@ -49,9 +48,10 @@ class _Chunks(NamedTuple):
 def _gather(targets: StructureTarget, index, structure) -> _Chunks:
     likelihood: Any = targets.log_likelihood
     gains = jax.tree.map(lambda leaf: leaf[index, structure], likelihood.gains)
-    bare = eqx.tree_at(lambda x: (x.gains, x.structures), likelihood, (None, None))
+    reference = likelihood.reference[index, structure]
+    bare = without_gains(likelihood)
     bare = jax.tree.map(lambda leaf: leaf[index], bare)
-    return _Chunks(bare, gains, targets.structures[index, structure])
+    return _Chunks(bare, gains, reference, targets.structures[index, structure])
 
 
 @QuickCompile
@@ -59,12 +59,12 @@ def _evaluate_chunks(chunks: _Chunks, z):
     """Log-likelihoods of chunks `[chunk, point, dim]`."""
 
     def one_chunk(chunk, z):
-        likelihood, gains, active = chunk
+        likelihood, gains, reference, active = chunk
         log_volume = gains.log_volume
 
         def one_point(z):
             found = likelihood.innovations(z, active, gains)
-            value = likelihood.log_marginal(found.statistics, log_volume)
+            value = likelihood.log_marginal(found.statistics, log_volume, reference)
             return value, found.statistics, found.whitened.reshape(-1)
 
         return jax.vmap(one_point)(z)
@@ -114,45 +114,15 @@ def evaluate_points(
     Returns:
         One row per point, in the order given.
     """
-    num_points = z.shape[0]
-    num_structures = targets.structures.shape[1]
-    group = index.astype(np.int64) * num_structures + structure
-    order = np.argsort(group, kind="stable")
-    names, begins, sizes = np.unique(
-        group[order], return_index=True, return_counts=True
-    )
-    num_chunks = -(-sizes // _CHUNK)
-    total = int(num_chunks.sum())
-    padded = -(-total // _CHUNKS_PER_CALL) * _CHUNKS_PER_CALL
-    # Which point fills each place; places left over repeat their group's first point.
-    source = np.zeros((padded, _CHUNK), np.int64)
-    owner = np.zeros(padded, np.int64)
-    first = 0
-    for name, begin, size, count in zip(names, begins, sizes, num_chunks, strict=True):
-        places = np.full(count * _CHUNK, order[begin])
-        places[:size] = order[begin : begin + size]
-        source[first : first + count] = places.reshape(count, _CHUNK)
-        owner[first : first + count] = name
-        first += count
-    if first:
-        source[first:], owner[first:] = source[0, 0], owner[0]
-    parts = [slice(n, n + _CHUNKS_PER_CALL) for n in range(0, padded, _CHUNKS_PER_CALL)]
+    chunks = Chunking.of(index, structure, targets.structures.shape[1])
     calls = call_each(
         _call,
-        [
-            (targets, *divmod(owner[rows], num_structures), z[source[rows]])
-            for rows in parts
-        ],
+        [(targets, *owner, z[rows]) for owner, rows in chunks.calls()],
         targets,
     )
-    flat = source[:total].reshape(-1)
 
     def gather(pick):
-        found = np.concatenate([pick(call) for call in calls])
-        joined = found.reshape(-1, *found.shape[2:])[: flat.size]
-        out = np.empty((num_points, *joined.shape[1:]), joined.dtype)
-        out[flat] = joined
-        return out
+        return chunks.in_order([pick(call) for call in calls])
 
     log_likelihood = gather(lambda call: call[0]).astype(float)
     log_density = log_likelihood + log_prior_density(targets, index, structure, z)

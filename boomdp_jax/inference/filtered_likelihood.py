@@ -31,14 +31,17 @@ class Innovations(NamedTuple):
 
 
 class FilteredLikelihood(eqx.Module):
-    """Log-likelihood of coordinates and active slots; what samplers call."""
+    """Log-likelihood of coordinates and active slots; what samplers call.
+
+    What belongs to structures is absent where gains are handed on (`without_gains`).
+    """
 
     coordinates: Coordinates
     data: TrackData
     structures: Bool[Array, "structure slot"] | None
     gains: Gains | None
-    """With a leading structure axis. Both may be absent where gains are passed on."""
-    reference: Float[Array, "body 4"]
+    """With a leading structure axis."""
+    reference: Float[Array, "structure body 4"] | None
     """Noise that the gains were made for."""
 
     def __call__(
@@ -48,7 +51,9 @@ class FilteredLikelihood(eqx.Module):
         structure = self.structure_index(active)
         gains = self.gains_of(structure)
         found = self.innovations(z, active, gains)
-        return self.log_marginal(found.statistics, gains.log_volume)
+        return self.log_marginal(
+            found.statistics, gains.log_volume, self.reference[structure]
+        )
 
     def structure_index(self, active: Bool[Array, " slot"]) -> IntScalar:
         """Which structure has these slots active."""
@@ -73,21 +78,27 @@ class FilteredLikelihood(eqx.Module):
         )
 
     def log_marginal(
-        self, statistics: NoiseStatistics, log_volume: FloatScalar
+        self,
+        statistics: NoiseStatistics,
+        log_volume: FloatScalar,
+        reference: Float[Array, "body 4"],
     ) -> FloatScalar:
-        """The same from statistics."""
+        """The same from statistics of innovations whitened for a noise."""
+        relative_scale = self.coordinates.scales.noise[None] / reference
         each = jax.vmap(
             lambda num, square, scale: log_marginal(
                 NoiseStatistics(num[None], square[None]), scale
             )
-        )(statistics.num, statistics.square, self.relative_scale)
+        )(statistics.num, statistics.square, relative_scale)
         value = jnp.sum(each) + log_volume
         return jnp.where(jnp.isfinite(value), value, -1e30)
 
-    @property
-    def relative_scale(self) -> Float[Array, "body 4"]:
-        """Prior scale of the factor by which the noise differs from the reference."""
-        return self.coordinates.scales.noise[None] / self.reference
+
+def without_gains(likelihood: FilteredLikelihood) -> FilteredLikelihood:
+    """What all structures share; calls of it need gains handed to them."""
+    return eqx.tree_at(
+        lambda x: (x.gains, x.structures, x.reference), likelihood, (None, None, None)
+    )
 
 
 def _group_sums(values: Float[Array, "time 2 body 6"]) -> Float[Array, "body 4"]:

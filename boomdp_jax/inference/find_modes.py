@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from boomdp_jax.core.arrays import Key
+from boomdp_jax.inference.evaluate import evaluate_points
 from boomdp_jax.inference.fit import (
     Fits,
     FitSettings,
@@ -21,16 +22,20 @@ from boomdp_jax.inference.fit import (
     join_fits,
     make_fits,
 )
-from boomdp_jax.inference.fit_noise import NoiseFit, fit_noise, with_gains
+from boomdp_jax.inference.fit_noise import fit_noise, with_gains
 from boomdp_jax.inference.fit_starts import Guesses, first_fits, grown_fits
 from boomdp_jax.inference.noise import host_generator
+from boomdp_jax.inference.noise_level import NoiseFit
 from boomdp_jax.inference.target import StructureTarget
 
 # Rounds of noise, gains and fit.
 _NUM_ROUNDS = 2
-# Noise starts too high rather than too low, in units of the prior's scale, and the
-# impulses at the prior's scale of velocity readings.
-_START_NOISE = 5.0
+# Noise starts too high rather than too low: readings at so many times the residuals of
+# single steps, impulses at those residuals.
+_START_NOISE = 3.0
+# Structures of a lone body whose noise is fitted, the most probable ones; the work
+# grows with the square of the number of channels.
+_MOST_FITTED = 8
 
 
 class Found(NamedTuple):
@@ -39,6 +44,7 @@ class Found(NamedTuple):
     targets: StructureTarget
     modes: Modes
     noise: NoiseFit
+    """Of every structure of every object, in order."""
 
 
 def find_modes(
@@ -64,15 +70,11 @@ def find_modes(
     guesses = Guesses.of(targets)
     report("fitting single steps")
     fits = _single_step_fits(rng, targets, guesses, settings)
-    likelihood: Any = targets.log_likelihood
-    scale = np.asarray(likelihood.coordinates.scales.noise, float)
-    num_bodies = likelihood.reference.shape[1]
-    reading = np.repeat(_START_NOISE * scale[:, None], num_bodies, axis=1)
-    noise = NoiseFit(reading, np.repeat(scale[:, None, 2:], num_bodies, axis=1))
+    noise = _first_noise(targets, best_of_each(fits, num_structures, 1))
     for number in range(_NUM_ROUNDS):
         report(f"fitting noise and filters, round {number + 1} of {_NUM_ROUNDS}")
         top = best_of_each(fits, num_structures, 1)
-        noise = fit_noise(targets, _champions(targets, top), noise)
+        noise = _noise_of_structures(targets, top, noise)
         targets = with_gains(targets, top, noise)
         again = make_fits(targets, fits.index, fits.structure, fits.z)
         again = best_of_each(again, num_structures, settings.num_starts)
@@ -117,14 +119,55 @@ def _single_step_fits(
     return join_fits(fits, climb(targets, grown, settings.num_iterations))
 
 
-def _champions(targets: StructureTarget, top: Fits) -> Fits:
-    """The most probable structure's best fit of every object, by Laplace's evidence."""
-    num_objects, num_structures = targets.structures.shape[:2]
+def _first_noise(targets: StructureTarget, top: Fits) -> NoiseFit:
+    """Where the noise of every structure starts: residuals of each object's best fit.
+
+    Args:
+        targets: with one-step gains.
+        top: one fit of every structure of every object, in order.
+    """
+    likelihood: Any = targets.log_likelihood
+    evidence = _laplace_evidence(targets, top)
+    num_objects, num_structures = evidence.shape
+    champion = np.argmax(evidence, axis=1)
+    best = top.take(np.arange(num_objects) * num_structures + champion)
+    found = evaluate_points(targets, best.index, best.structure, best.z)
+    scale = np.asarray(likelihood.coordinates.scales.noise, float)[:, None]
+    square = np.where(found.num > 0, found.square / np.maximum(found.num, 1.0), 0.0)
+    residual = scale * np.sqrt(1.0 + np.nan_to_num(square))
+    start = NoiseFit(_START_NOISE * residual, residual[..., 2:])
+    return start.take(np.repeat(np.arange(num_objects), num_structures))
+
+
+def _noise_of_structures(
+    targets: StructureTarget, top: Fits, start: NoiseFit
+) -> NoiseFit:
+    """Noise of the most probable structures; the others get that of the best.
+
+    Args:
+        targets: stacked along a leading object axis.
+        top: one fit of every structure of every object, in order.
+        start: where to start for each of them.
+    """
+    evidence = _laplace_evidence(targets, top)
+    num_objects, num_structures = evidence.shape
+    num_bodies = start.reading.shape[1]
+    num_fitted = min(max(1, _MOST_FITTED // num_bodies**2), num_structures)
+    order = np.argsort(-evidence, axis=1, kind="stable")[:, :num_fitted]
+    chosen = (np.arange(num_objects)[:, None] * num_structures + order).reshape(-1)
+    peaks = fit_noise(targets, top.take(chosen), start.take(chosen))
+    vector = peaks.noise.vector.reshape(num_objects, num_fitted, -1)
+    out = np.repeat(vector[:, :1], num_structures, axis=1).reshape(len(top.z), -1)
+    out[chosen] = vector.reshape(len(chosen), -1)
+    return NoiseFit.of_vector(out)
+
+
+def _laplace_evidence(targets: StructureTarget, top: Fits) -> np.ndarray:
+    """Of one fit of every structure of every object, `[object, structure]`."""
     sign, log_volume = np.linalg.slogdet(top.precision)
     evidence = np.where(sign > 0, top.value - 0.5 * log_volume, -np.inf)
     evidence = evidence + 0.5 * np.log(2.0 * np.pi) * _num_used(targets)[top.structure]
-    best = np.argmax(evidence.reshape(num_objects, num_structures), axis=1)
-    return top.take(np.arange(num_objects) * num_structures + best)
+    return evidence.reshape(targets.structures.shape[:2])
 
 
 def _num_used(targets: StructureTarget) -> np.ndarray:

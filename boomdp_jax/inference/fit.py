@@ -108,7 +108,7 @@ class Host(NamedTuple):
             in_use=active[:, slot],
             is_normal=period == 0,
             period=period,
-            rate=(scale[:, None] / reference) ** 2,
+            rate=(scale[:, None, None] / reference) ** 2,
         )
 
     def wrap(self, z: np.ndarray) -> np.ndarray:
@@ -261,7 +261,9 @@ def normal_equations(
     jacobian[fit, coordinate] = (changed - u[fit]) / delta[fit, coordinate][:, None]
     jacobian = np.where(np.isfinite(jacobian), jacobian, 0.0)
     num, square = found.num[: len(fits.z)], found.square[: len(fits.z)]
-    weight = (NOISE_SHAPE + 0.5 * num) / (host.rate[fits.index] + 0.5 * square)
+    weight = (NOISE_SHAPE + 0.5 * num) / (
+        host.rate[fits.index, fits.structure] + 0.5 * square
+    )
     weight = np.where(np.isfinite(weight), weight, 0.0)[..., _GROUP]
     weight = np.tile(weight.reshape(len(fits.z), -1), (1, u.shape[1] // weight[0].size))
     weighted = jacobian * weight[:, None]

@@ -7,187 +7,145 @@ import jax
 import numpy as np
 
 from boomdp_jax.core.arrays import on_device
-from boomdp_jax.core.quick_compile import QuickCompile
-from boomdp_jax.core.side_by_side import call_each
+from boomdp_jax.inference.filter_points import filter_densities, filter_points
 from boomdp_jax.inference.fit import Fits
-from boomdp_jax.inference.kalman import Filtered, NoiseLevel, extended_filter
+from boomdp_jax.inference.noise_level import NoiseFit, log_noise_prior
 from boomdp_jax.inference.target import StructureTarget
 
-_INDEX = np.dtype(np.int32)
-# Points filtered by one call of the compiled program.
-_POINTS_PER_CALL = 8
-# Prior of the impulses: log-normal about this share of the prior scale of velocity and
-# spin readings. It has to keep an impulse that data do not show from wandering off.
-_IMPULSE_SHARE, _IMPULSE_SPREAD = 0.1, 2.0
-_NUM_ITERATIONS = 6
+# Steps of the differences, in logarithms of noise.
 _DIFFERENCE = 0.2
 _LONGEST_STEP = 1.5
+_LENGTHS = np.array([1.0, 0.5, 0.2])
+# A fit that gains less in an iteration has arrived.
+_ARRIVED = 0.02
+# Least curvature: the prior of an impulse has 0.25.
+_LEAST_CURVATURE = 0.2
 
 
-class NoiseFit(NamedTuple):
-    """Noise of each object, on the host."""
+class NoisePeaks(NamedTuple):
+    """Most probable noise at a list of hypotheses, and how well it is known."""
 
-    reading: np.ndarray
-    """`[object, body, 4]`."""
-    impulse: np.ndarray
-    """`[object, body, 2]`."""
-
-
-@QuickCompile
-def _filter_points(targets: StructureTarget, index, structure, z, noise: NoiseLevel):
-    def one(i, k, z, noise):
-        target = jax.tree.map(lambda leaf: leaf[i], targets)
-        likelihood: Any = target.log_likelihood
-        coordinates = likelihood.coordinates
-        params = coordinates(z, target.structures[k])
-        return extended_filter(coordinates.scene, params, likelihood.data, noise)
-
-    return jax.vmap(one)(index, structure, z, noise)
+    noise: NoiseFit
+    precision: np.ndarray
+    """Minus the Hessian of the log-density in the logarithms, made positive, `[point,
+    number, number]`."""
+    log_density: np.ndarray
+    """Of readings and noise, `[point]`."""
 
 
-def _filter_on_host(*arguments):
-    return jax.tree.map(np.asarray, _filter_points(*arguments))
+def fit_noise(
+    targets: StructureTarget, fits: Fits, start: NoiseFit, num_iterations: int = 12
+) -> NoisePeaks:
+    """Maximise likelihood times prior over the noise at hypotheses that stay fixed.
 
-
-def filter_points(
-    targets: StructureTarget,
-    index: np.ndarray,
-    structure: np.ndarray,
-    z: np.ndarray,
-    noise: NoiseFit,
-) -> Filtered:
-    """Run the extended filter at a list of points, each with its own noise.
+    Newton's method on the logarithms by differences; directions in which the density
+    curves upwards are followed as if it curved downwards as much, and three lengths of
+    every step are tried.
 
     Args:
         targets: with a `FilteredLikelihood`, stacked along a leading object axis.
-        index: object of each point.
-        structure: of each point.
-        z: coordinates of each point.
-        noise: of each point.
-
-    Returns:
-        Gains and log-likelihoods, leading axis `point`, on the host.
-    """
-    num = len(index)
-    dtype = targets.log_prior.dtype
-    inputs = []
-    for begin in range(0, num, _POINTS_PER_CALL):
-        rows = np.minimum(np.arange(begin, begin + _POINTS_PER_CALL), num - 1)
-        level = NoiseLevel(
-            on_device(noise.reading[rows], dtype), on_device(noise.impulse[rows], dtype)
-        )
-        inputs.append(
-            (
-                targets,
-                on_device(index[rows], _INDEX),
-                on_device(structure[rows], _INDEX),
-                on_device(z[rows], dtype),
-                level,
-            )
-        )
-    calls = call_each(_filter_on_host, inputs, targets)
-    return jax.tree.map(lambda *parts: np.concatenate(parts)[:num], *calls)
-
-
-def fit_noise(targets: StructureTarget, best: Fits, start: NoiseFit) -> NoiseFit:
-    """Maximise the filter's marginal likelihood over the noise of each object.
-
-    Newton's method on the logarithms with the diagonal of the Hessian, by differences;
-    three lengths of every step are tried.
-
-    Args:
-        targets: with a `FilteredLikelihood`, stacked along a leading object axis.
-        best: the one hypothesis of each object at which to do so, in order.
+        fits: the hypotheses.
         start: where to start; better too high than too low.
+        num_iterations: most iterations; with 0 the curvature at the start is found.
 
     Returns:
-        The noise.
+        The noise of each.
     """
-    num_objects, num_bodies = start.reading.shape[:2]
-    likelihood: Any = targets.log_likelihood
-    prior = np.asarray(likelihood.coordinates.scales.noise, float)
-
-    def pack(noise: NoiseFit) -> np.ndarray:
-        both = np.concatenate([noise.reading, noise.impulse], axis=-1)
-        return np.log(both).reshape(num_objects, -1)
-
-    def unpack(x: np.ndarray) -> NoiseFit:
-        both = np.exp(x).reshape(-1, num_bodies, 6)
-        return NoiseFit(both[..., :4], both[..., 4:])
-
-    def objective(x: np.ndarray) -> np.ndarray:
-        """Of `[object, try, number]`."""
-        num_tries = x.shape[1]
-        rows = np.repeat(np.arange(num_objects), num_tries)
-        noise = unpack(x.reshape(-1, x.shape[-1]))
-        found = filter_points(
-            targets, best.index[rows], best.structure[rows], best.z[rows], noise
-        )
-        scale = prior[rows][:, None]
-        ratio = (scale / noise.reading) ** 2
-        log_prior = np.sum(np.log(ratio) - ratio, axis=(1, 2))
-        middle = _IMPULSE_SHARE * scale[..., 2:]
-        offset = np.log(noise.impulse / middle) / _IMPULSE_SPREAD
-        log_prior -= 0.5 * np.sum(offset**2, axis=(1, 2))
-        value = np.asarray(found.log_likelihood, float) + log_prior
-        return np.where(np.isfinite(value), value, -np.inf).reshape(-1, num_tries)
-
-    x = pack(start)
-    size = x.shape[1]
-    shifts = _DIFFERENCE * np.concatenate([np.zeros((1, size)), np.eye(size)])
-    shifts = np.concatenate([shifts, -shifts[1:]])
-    for _ in range(_NUM_ITERATIONS):
-        values = objective(x[:, None] + shifts[None])
-        here, up, down = values[:, :1], values[:, 1 : size + 1], values[:, size + 1 :]
-        slope = (up - down) / (2.0 * _DIFFERENCE)
-        bend = -(up - 2.0 * here + down) / _DIFFERENCE**2
-        step = np.nan_to_num(slope / np.maximum(bend, 0.5))
-        step = np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
-        lengths = np.array([1.0, 0.5, 0.2])
-        tries = x[:, None] + lengths[None, :, None] * step[:, None]
-        found = objective(tries)
-        choice = np.argmax(found, axis=1)
-        each = np.arange(num_objects)
-        is_better = found[each, choice] > here[:, 0]
-        x = np.where(is_better[:, None], tries[each, choice], x)
-        if np.all(np.abs(step).max(axis=1) < 0.05):
+    density = _Density(targets, fits)
+    x = start.vector.copy()
+    value = np.full(len(x), -np.inf)
+    precision = np.zeros((*x.shape, x.shape[1]))
+    rows = np.arange(len(x))
+    for iteration in range(num_iterations + 1):
+        here, slope, matrix = density.derivatives(rows, x[rows])
+        value[rows], precision[rows] = here, matrix
+        if iteration == num_iterations:
             break
-    return unpack(x)
+        step = np.linalg.solve(matrix, slope[..., None])[..., 0]
+        longest = np.abs(step).max(axis=1, keepdims=True)
+        step = step * np.minimum(1.0, _LONGEST_STEP / np.maximum(longest, 1e-12))
+        tries = x[rows][:, None] + _LENGTHS[None, :, None] * step[:, None]
+        found = density(rows, tries)
+        choice = np.argmax(found, axis=1)
+        each = np.arange(len(rows))
+        is_better = found[each, choice] > here
+        gain = np.where(is_better, found[each, choice] - here, 0.0)
+        x[rows] = np.where(is_better[:, None], tries[each, choice], x[rows])
+        rows = rows[gain > _ARRIVED]
+        if not rows.size:
+            break
+    return NoisePeaks(NoiseFit.of_vector(x), precision, value)
+
+
+class _Density:
+    """Log-density of noise at the hypotheses of a list."""
+
+    def __init__(self, targets: StructureTarget, fits: Fits):
+        likelihood: Any = targets.log_likelihood
+        self._targets, self._fits = targets, fits
+        self._scale = np.asarray(likelihood.coordinates.scales.noise, float)
+
+    def __call__(self, rows: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Of `[point, try, number]` at some hypotheses, `[point, try]`."""
+        fits = self._fits.take(np.repeat(rows, x.shape[1]))
+        vector = x.reshape(-1, x.shape[-1])
+        found = filter_densities(
+            self._targets,
+            fits.index,
+            fits.structure,
+            fits.z,
+            NoiseFit.of_vector(vector),
+        )
+        found = found + log_noise_prior(self._scale[fits.index], vector)
+        return found.reshape(x.shape[:2])
+
+    def derivatives(self, rows: np.ndarray, x: np.ndarray):
+        """Value, gradient and minus the Hessian, made positive."""
+        size = x.shape[1]
+        first, second = np.triu_indices(size, 1)
+        unit = _DIFFERENCE * np.eye(size)
+        shifts = np.concatenate(
+            [np.zeros((1, size)), unit, -unit, unit[first] + unit[second]]
+        )
+        value = self(rows, x[:, None] + shifts[None])
+        worst = np.where(np.isfinite(value), value, np.inf).min(axis=1, keepdims=True)
+        value = np.where(np.isfinite(value), value, worst)
+        here, up, down = value[:, 0], value[:, 1 : size + 1], value[:, size + 1 :]
+        down, both = down[:, :size], down[:, size:]
+        slope = (up - down) / (2.0 * _DIFFERENCE)
+        each = np.arange(size)
+        hessian = np.zeros((len(x), size, size))
+        hessian[:, each, each] = up - 2.0 * here[:, None] + down
+        hessian[:, first, second] = both - up[:, first] - up[:, second] + here[:, None]
+        hessian[:, second, first] = hessian[:, first, second]
+        length, way = np.linalg.eigh(-hessian / _DIFFERENCE**2)
+        length = np.maximum(np.abs(length), _LEAST_CURVATURE)
+        matrix = (way * length[:, None]) @ np.swapaxes(way, 1, 2)
+        return here, slope, matrix
 
 
 def with_gains(
     targets: StructureTarget, best: Fits, noise: NoiseFit
 ) -> StructureTarget:
-    """Give every structure the gains of its own best fit.
+    """Give every structure the gains of its own best fit with its own noise.
 
     Args:
         targets: with a `FilteredLikelihood`, stacked along a leading object axis.
         best: one fit of every structure of every object, in order.
-        noise: of each object.
+        noise: of each of them.
 
     Returns:
         Targets whose likelihood tracks with the new gains.
     """
-    num_objects, num_structures = targets.structures.shape[:2]
-    rows = best.index
-    found = filter_points(
-        targets,
-        rows,
-        best.structure,
-        best.z,
-        NoiseFit(noise.reading[rows], noise.impulse[rows]),
-    )
+    shape = targets.structures.shape[:2]
+    found = filter_points(targets, best.index, best.structure, best.z, noise)
     dtype = targets.log_prior.dtype
-    gains = jax.tree.map(
-        lambda leaf: on_device(
-            np.asarray(leaf).reshape(num_objects, num_structures, *leaf.shape[1:]),
-            dtype,
-        ),
-        found.gains,
-    )
-    reference = on_device(noise.reading, dtype)
+
+    def arrange(leaf):
+        return on_device(np.asarray(leaf).reshape(*shape, *leaf.shape[1:]), dtype)
+
     return eqx.tree_at(
         lambda t: (t.log_likelihood.gains, t.log_likelihood.reference),
         targets,
-        (gains, reference),
+        (jax.tree.map(arrange, found.gains), arrange(noise.reading)),
     )

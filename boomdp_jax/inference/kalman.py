@@ -56,6 +56,18 @@ def channel_scale(reading):
     return reading[:, np.asarray(_GROUP)]
 
 
+def kick_scale(impulse):
+    """Sd of the kicks of channels `[body, 6]` from that of impulses `[body, 2]`."""
+    rest = jnp.zeros_like(impulse[:, :1])
+    slow, spin = impulse[:, :1], impulse[:, 1:]
+    return jnp.concatenate([rest, rest, rest, slow, slow, spin], axis=-1)
+
+
+def start_scale(num_bodies: int):
+    """Sd of every channel of a start that was not read, body by body."""
+    return jnp.tile(jnp.asarray(_UNKNOWN_START), num_bodies)
+
+
 def extended_filter(
     scene: Scene, params: Params, data: TrackData, noise: NoiseLevel
 ) -> Filtered:
@@ -76,16 +88,8 @@ def extended_filter(
     num = 6 * num_bodies
     scale = channel_scale(noise.reading).reshape(-1)
     variance = jnp.diag(scale**2)
-    kick = jnp.concatenate(
-        [
-            jnp.zeros((num_bodies, 3)),
-            noise.impulse[:, :1],
-            noise.impulse[:, :1],
-            noise.impulse[:, 1:],
-        ],
-        axis=-1,
-    ).reshape(-1)
-    unknown = jnp.tile(jnp.asarray(_UNKNOWN_START), num_bodies)
+    kick = kick_scale(noise.impulse).reshape(-1)
+    unknown = start_scale(num_bodies)
     offsets = jnp.diag(scale).reshape(num, num_bodies, 6)
 
     def update(state, covariance, reading, mask):

@@ -34,9 +34,10 @@ from boomdp_jax.inference.kind_state import KindData, Tallies
 from boomdp_jax.inference.kinds_file import LearntKinds
 from boomdp_jax.inference.kinds_posterior import KindsPosterior
 from boomdp_jax.inference.noise import host_generator
+from boomdp_jax.inference.noise_scales import draw_noise_scales
 from boomdp_jax.inference.one_step import NOISE_SHAPE
 from boomdp_jax.inference.posterior import Posterior, library_versions
-from boomdp_jax.inference.sample import BlockDraws, draw_noise_scales
+from boomdp_jax.inference.sample import BlockDraws
 from boomdp_jax.inference.structure_chain import ChainDraws
 from boomdp_jax.inference.structure_draws import SampleSettings
 from boomdp_jax.physics.scene_spec import SceneSpec
@@ -314,6 +315,7 @@ def _posteriors(
             z=own[None],
             log_density=np.zeros((1, num_draws)),
             noise_scale=noise[i][None],
+            impulse_scale=None,
             log_evidence=np.full(1, np.nan),
             evidence=None,
             diagnostics=[verdict],

@@ -181,6 +181,7 @@ def _block_draws(spec: SceneSpec, block: Block, draws: ModelDraws) -> BlockDraws
         z=flat(draws.z),
         log_density=flat(draws.log_density),
         noise_scale=flat(draws.noise_scale),
+        impulse_scale=None,
         log_evidence=np.full(1, draws.log_evidence),
         evidence=None,
         diagnostics=[verdict._replace(reasons=named)],

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from boomdp_jax.core.arrays import FloatScalar, Key
 from boomdp_jax.core.history import History
@@ -28,11 +28,12 @@ from boomdp_jax.inference.posterior_report import (
     report_structures,
     structure_probabilities,
 )
+from boomdp_jax.inference.random_motion import add_impulse, add_reading_noise
 from boomdp_jax.inference.summary import plain
 from boomdp_jax.physics import step
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
-from boomdp_jax.physics.state import State, state_from_array
+from boomdp_jax.physics.state import State
 
 
 class Record(dict):
@@ -104,6 +105,11 @@ class Posterior(eqx.Module):
     """`ok`, `reasons`, and the numbers behind them."""
     seconds: dict = eqx.field(static=True, converter=_record, default_factory=dict)
     """Wall time spent on `compile` and on `run` [s]."""
+    impulse_scale: Float[Array, "draw body 2"] | None = None
+    """Sd of the change of velocity [m/s] and spin [rad/s] that every step starts with:
+    noise of the motion itself. None where the method takes the motion as exact."""
+    prior_impulse_scale: Float[Array, "prior_draw body 2"] | None = None
+    """Prior draws of `impulse_scale`."""
     seed: int | None = eqx.field(static=True, default=None)
     versions: dict = eqx.field(
         static=True, converter=_record, default_factory=library_versions
@@ -155,6 +161,8 @@ class Posterior(eqx.Module):
                 np.asarray(self.noise_scale, np.float64),
                 weights,
                 np.asarray(self.prior_noise_scale, np.float64),
+                _double(self.impulse_scale),
+                _double(self.prior_impulse_scale),
             ),
             "log_evidence": float(self.log_evidence),
             "diagnostics": {"ok": True, "reasons": [], **self.diagnostics},
@@ -199,13 +207,27 @@ class Posterior(eqx.Module):
         chosen = np.minimum(np.searchsorted(cumulative, levels), self.num_draws - 1)
         kept = jax.tree.map(
             lambda leaf: leaf[chosen],
-            (self.params, self.noise_scale, self.log_density, self.chain),
+            (
+                self.params,
+                self.noise_scale,
+                self.impulse_scale,
+                self.log_density,
+                self.chain,
+            ),
         )
         equal = jnp.full(num_draws, -np.log(num_draws), self.log_weight.dtype)
         return eqx.tree_at(
-            lambda p: (p.params, p.noise_scale, p.log_density, p.chain, p.log_weight),
+            lambda p: (
+                p.params,
+                p.noise_scale,
+                p.impulse_scale,
+                p.log_density,
+                p.chain,
+                p.log_weight,
+            ),
             self,
             (*kept, equal),
+            is_leaf=lambda leaf: leaf is None,
         )
 
     def transition(
@@ -213,9 +235,10 @@ class Posterior(eqx.Module):
     ) -> State:
         """Draw the next reading: the paper's generative process, one call.
 
-        Φ, σ ~ P(·|h); the state is stepped under Φ; noise of scale σ is added. Every
-        call draws a new hypothesis; a planner that keeps one down its tree takes it
-        from `sample_params`.
+        Φ, σ ~ P(·|h); the state is stepped under Φ, after an impulse where the motion
+        has noise of its own; noise of scale σ is added. Every call draws a new
+        hypothesis; a planner that keeps one down its tree takes it from
+        `sample_params`.
 
         Args:
             key: random key.
@@ -225,14 +248,16 @@ class Posterior(eqx.Module):
         Returns:
             A reading of the next state.
         """
-        draw_key, noise_key = jax.random.split(key)
+        draw_key, noise_key, kick_key = jax.random.split(key, 3)
         chosen = self.sample_indices(draw_key, 1)[0]
-        params, noise_scale = jax.tree.map(
-            lambda leaf: leaf[chosen], (self.params, self.noise_scale)
+        params, noise_scale, impulse_scale = jax.tree.map(
+            lambda leaf: leaf[chosen],
+            (self.params, self.noise_scale, self.impulse_scale),
         )
         with jax.ensure_compile_time_eval():
             scene = self.spec.scene
         params = self.spec.with_surface(params)
+        state = add_impulse(kick_key, state, impulse_scale, scene.is_static)
         next_state, _ = step(scene, params, state, wrench)
         return add_reading_noise(noise_key, next_state, noise_scale, scene.is_static)
 
@@ -271,8 +296,9 @@ class Posterior(eqx.Module):
             f"inferred.{kind}": np.asarray(slots, bool)
             for kind, slots in self.inferred.items()
         }
-        for name in _ARRAYS:
-            arrays[name] = np.asarray(getattr(self, name))
+        for name in _ARRAYS + _OPTIONAL:
+            if getattr(self, name) is not None:
+                arrays[name] = np.asarray(getattr(self, name))
         header = {
             "scene": self.spec.to_dict(),
             "diagnostics": plain(dict(self.diagnostics)),
@@ -308,6 +334,7 @@ _ARRAYS = (
     "prior_noise_scale",
     "log_evidence",
 )
+_OPTIONAL = ("impulse_scale", "prior_impulse_scale")
 
 
 def load_posterior(path: str | os.PathLike) -> Posterior:
@@ -332,7 +359,11 @@ def load_posterior(path: str | os.PathLike) -> Posterior:
             f"{path}: expected draws of {len(spec.bodies)} bodies as in the scene, got "
             f"{num_bodies}"
         )
-    fields: dict[str, Any] = {name: jnp.asarray(arrays[name]) for name in _ARRAYS}
+    fields: dict[str, Any] = {
+        name: jnp.asarray(arrays[name])
+        for name in _ARRAYS + _OPTIONAL
+        if name in arrays
+    }
     for name in ("diagnostics", "seconds", "seed", "versions"):
         fields[name] = header[name]
     fields["inferred"] = {
@@ -343,29 +374,8 @@ def load_posterior(path: str | os.PathLike) -> Posterior:
     return Posterior(params=params, prior_params=prior_params, spec=spec, **fields)
 
 
-def add_reading_noise(
-    key: Key,
-    state: State,
-    noise_scale: Float[Array, "*#batch body 4"],
-    is_static: Bool[Array, " body"],
-) -> State:
-    """Add independent noise to readings; a static body has none.
-
-    Args:
-        key: random key.
-        state: true poses and twists.
-        noise_scale: sd of position [m], angle [rad], velocity [m/s], spin [rad/s].
-        is_static: which bodies are part of the room.
-
-    Returns:
-        The readings.
-    """
-    truth = state.array
-    scale = noise_scale[..., jnp.array([0, 0, 1, 2, 2, 3])]
-    scale = jnp.broadcast_to(scale, truth.shape)
-    scale = jnp.where(jnp.broadcast_to(is_static[:, None], truth.shape), 0.0, scale)
-    noise = jax.random.normal(key, truth.shape, truth.dtype)
-    return state_from_array(truth + scale * noise)
+def _double(array: Array | None) -> np.ndarray | None:
+    return None if array is None else np.asarray(array, np.float64)
 
 
 def _on_host(params: Params) -> Params:

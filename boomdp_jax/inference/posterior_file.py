@@ -53,6 +53,8 @@ _SHAPES = {
     "log_density": ("draw",),
     "chain": ("draw",),
     "prior_noise_scale": ("prior draw", "body", 4),
+    "impulse_scale": ("draw", "body", 2),
+    "prior_impulse_scale": ("prior draw", "body", 2),
     "log_evidence": (),
     "inferred.revolute": ("revolute slot",),
     "inferred.distance": ("distance slot",),
@@ -70,6 +72,8 @@ _PARAM_SHAPES = {
     "wheel": ("body", "wheel slot"),
     "ground": ("body", "ground slot"),
 }
+_IMPULSES = ("impulse_scale", "prior_impulse_scale")
+"""Both are there, or neither."""
 _PAIRS = {
     "revolute": ("anchor_a", "anchor_b", "limit", "motor"),
     "distance": ("anchor_a", "anchor_b"),
@@ -179,6 +183,7 @@ def _expected_shapes(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple]:
         name: axes
         for name, axes in _SHAPES.items()
         if _has(name.removeprefix("inferred."), arrays)
+        and (name not in _IMPULSES or any(other in arrays for other in _IMPULSES))
     }
     for prefix, draw in (("params", "draw"), ("prior_params", "prior draw")):
         shapes[f"{prefix}.density"] = (draw, *_PARAM_SHAPES["density"])

@@ -10,7 +10,7 @@ from boomdp_jax.inference.structure_report import (
     report_slots,
     structure_name,
 )
-from boomdp_jax.inference.summary import CHANNELS, summarise
+from boomdp_jax.inference.summary import CHANNELS, IMPULSES, summarise
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene_spec import SceneSpec
 
@@ -36,7 +36,13 @@ _TITLES = {
     "viscous": "viscous friction",
     "dry": "dry friction limit",
 }
-_NOISE_UNITS = dict(zip(CHANNELS, ("m", "rad", "m/s", "rad/s"), strict=True))
+_NOISE_UNITS = dict(
+    zip(
+        (*CHANNELS, *IMPULSES),
+        ("m", "rad", "m/s", "rad/s", "m/s", "rad/s"),
+        strict=True,
+    )
+)
 _LEAST_SHOWN = 0.001
 """Probability below which a structure is left out of the table (not of the object)."""
 
@@ -82,18 +88,30 @@ def report_noise(
     noise_scale: np.ndarray,
     weights: np.ndarray,
     prior_noise_scale: np.ndarray,
+    impulse_scale: np.ndarray | None = None,
+    prior_impulse_scale: np.ndarray | None = None,
 ) -> dict:
-    """Noise sd of every body's readings: position, angle, velocity, spin.
+    """Noise sd of every body's readings, and of its motion.
 
     Args:
         spec: the scene.
         noise_scale: draws, `[draw, body, 4]` [m, rad, m/s, rad/s].
         weights: of the draws, sum to one, `[draw]`.
         prior_noise_scale: prior draws, like `noise_scale`.
+        impulse_scale: draws of the motion's noise, `[draw, body, 2]` [m/s, rad/s].
+        prior_impulse_scale: prior draws of it.
 
     Returns:
-        By name of each body that can move, then by channel, a summary.
+        By name of each body that can move, then by channel (position, angle, velocity,
+        spin; velocity and spin impulse), a summary.
     """
+    channels = CHANNELS
+    if impulse_scale is not None and prior_impulse_scale is not None:
+        channels = (*CHANNELS, *IMPULSES)
+        noise_scale = np.concatenate([noise_scale, impulse_scale], axis=-1)
+        prior_noise_scale = np.concatenate(
+            [prior_noise_scale, prior_impulse_scale], axis=-1
+        )
     return {
         body.name: {
             name: summarise(
@@ -102,7 +120,7 @@ def report_noise(
                 prior_noise_scale[:, index, channel],
                 "log",
             )
-            for channel, name in enumerate(CHANNELS)
+            for channel, name in enumerate(channels)
         }
         for index, body in enumerate(spec.bodies)
         if not body.is_static
@@ -216,8 +234,9 @@ def format_report(report: dict, structures: dict[str, float], num_draws: int) ->
     lines += ["", "noise of one reading (sd)"]
     for name, noise in report["noise"].items():
         parts = [
-            f"{channel} {_plus_minus(noise[channel])} {unit}"
+            f"{channel.replace('_', ' ')} {_plus_minus(noise[channel])} {unit}"
             for channel, unit in _NOISE_UNITS.items()
+            if channel in noise
         ]
         lines.append(f"  {name:<14}{', '.join(parts)}")
     evidence = report["log_evidence"]

@@ -17,9 +17,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.core.history import History
-from boomdp_jax.inference.posterior import Posterior, add_reading_noise
+from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.random_motion import add_impulse, add_reading_noise
 from boomdp_jax.inference.summary import CHANNELS, plain
-from boomdp_jax.physics import Params, Scene, rollout, state_from_array
+from boomdp_jax.physics import Params, Scene, rollout, state_from_array, step
 
 SCHEMA = "boomdp-predict-1"
 
@@ -80,6 +81,7 @@ def predict(
         scene,
         posterior.spec.with_surface(kept.params),
         kept.noise_scale,
+        kept.impulse_scale,
         history,
         tuple(horizons),
     )
@@ -105,6 +107,7 @@ def sample_readings(
     wrenches: Float[Array, "draw time body 3"],
     dt: Float[Array, "draw time"],
     places: Int[Array, " place"],
+    impulse_scale: Float[Array, "draw body 2"] | None = None,
 ) -> Float[Array, "draw place body 6"]:
     """Draw what may be read later, one trajectory for each hypothesis.
 
@@ -117,23 +120,43 @@ def sample_readings(
         wrenches: held over each step [N, N, N m].
         dt: lengths of the steps [s].
         places: after which steps to read, counted from 0.
+        impulse_scale: noise of the motion [m/s, rad/s]; None: it has none.
 
     Returns:
         Readings at those places.
     """
-    start_key, end_key = jax.random.split(key)
+    start_key, end_key, kick_key = jax.random.split(key, 3)
     start = add_reading_noise(
         start_key, state_from_array(reading), noise_scale, scene.is_static
     )
 
-    def advance(params, state, wrenches, dt):
-        states, _ = rollout(scene, params, state, wrenches, dt=dt)
+    def advance(params, state, wrenches, dt, impulse_scale, key):
+        if impulse_scale is None:
+            states, _ = rollout(scene, params, state, wrenches, dt=dt)
+        else:
+            states = _rollout_with_impulses(
+                key, scene, params, state, wrenches, dt, impulse_scale
+            )
         return jax.tree.map(lambda leaf: leaf[places], states)
 
-    states = jax.vmap(advance)(params, start, wrenches, dt)
+    keys = jax.random.split(kick_key, len(reading))
+    states = jax.vmap(advance)(params, start, wrenches, dt, impulse_scale, keys)
     return add_reading_noise(
         end_key, states, noise_scale[:, None], scene.is_static
     ).array
+
+
+def _rollout_with_impulses(key, scene, params, state, wrenches, dt, impulse_scale):
+    """One trajectory whose velocities change at random before each step."""
+    keys = jax.random.split(key, len(dt))
+
+    def advance(state, row):
+        key, wrench, length = row
+        state = add_impulse(key, state, impulse_scale, scene.is_static)
+        state, _ = step(scene, params, state, wrench, dt=length)
+        return state, state
+
+    return jax.lax.scan(advance, state, (keys, wrenches, dt))[1]
 
 
 @functools.partial(jax.jit, static_argnames=("horizons",))
@@ -142,6 +165,7 @@ def _predict_rows(
     scene: Scene,
     params: Params,
     noise_scale: Float[Array, "draw body 4"],
+    impulse_scale: Float[Array, "draw body 2"] | None,
     history: History,
     horizons: tuple[int, ...],
 ) -> dict[str, Float[Array, "time horizon body 6"]]:
@@ -172,6 +196,7 @@ def _predict_rows(
             history.action[following],
             history.dt[following],
             places,
+            None if impulse_scale is None else impulse_scale[draw],
         ).reshape(num_starts, num_draws, *places.shape, -1, 6)
         low, high = jnp.quantile(readings, jnp.array([0.05, 0.95]), axis=1)
         return {

@@ -11,13 +11,13 @@ from boomdp_jax.core.arrays import Key, on_device
 from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics, diagnose_chains
 from boomdp_jax.inference.compile_ahead import CompileAhead, signature
 from boomdp_jax.inference.enumerate_structures import enumerate_structures
-from boomdp_jax.inference.evaluate import evaluate_points
+from boomdp_jax.inference.filter_points import filter_densities, filter_points
 from boomdp_jax.inference.find_modes import Found, find_modes
 from boomdp_jax.inference.fit import Modes
-from boomdp_jax.inference.fit_noise import NoiseFit, filter_points
 from boomdp_jax.inference.laplace_draws import best_hypothesis, sample_laplace
 from boomdp_jax.inference.noise import host_generator
-from boomdp_jax.inference.one_step import NOISE_SHAPE
+from boomdp_jax.inference.noise_correction import infer_noise
+from boomdp_jax.inference.noise_level import NoiseFit
 from boomdp_jax.inference.population import Population, sample_population
 from boomdp_jax.inference.structure_chain import ChainDraws
 from boomdp_jax.inference.structure_draws import (
@@ -55,7 +55,9 @@ class BlockDraws(NamedTuple):
     """`[object, draw, dim]`."""
     log_density: np.ndarray
     noise_scale: np.ndarray
-    """`[object, draw, body, 4]`."""
+    """Of readings, `[object, draw, body, 4]`."""
+    impulse_scale: np.ndarray | None
+    """Of the motion, `[object, draw, body, 2]`; None where it is taken as exact."""
     log_evidence: np.ndarray
     """`[object]`."""
     evidence: StructureEvidence | None
@@ -96,18 +98,60 @@ def sample_blocks(
     targets = found.targets
     report(_STAGES[method])
     drawn = draw(draw_key, targets, found.modes, settings, evaluate_each)
-    num_objects, num_chains = drawn.structure.shape[:2]
+    report("inferring the noise")
+    rng = host_generator(noise_key)
+    if method == "map":
+        return _with_fitted_noise(targets, found.noise, drawn)
+    corrected = infer_noise(
+        rng,
+        targets,
+        found.noise,
+        drawn.structure,
+        drawn.z,
+        drawn.log_density,
+        drawn.evidence,
+    )
+    shape = (corrected.structure.shape[0], corrected.structure[0].size)
+    return BlockDraws(
+        structure=corrected.structure.reshape(shape),
+        z=corrected.z.reshape(*shape, -1).astype(drawn.z.dtype),
+        log_density=corrected.log_density.reshape(shape),
+        noise_scale=corrected.noise.reading.reshape(*shape, -1, 4),
+        impulse_scale=corrected.noise.impulse.reshape(*shape, -1, 2),
+        log_evidence=corrected.evidence.total,
+        evidence=corrected.evidence,
+        diagnostics=[
+            _with_reasons(verdict, reasons)
+            for verdict, reasons in zip(
+                drawn.diagnostics, corrected.reasons, strict=True
+            )
+        ],
+        chain_index=np.arange(drawn.structure.shape[1]),
+    )
+
+
+def _with_reasons(verdict: ChainDiagnostics, reasons: list[str]) -> ChainDiagnostics:
+    reasons = [*verdict.reasons, *reasons]
+    return verdict._replace(ok=not reasons, reasons=reasons)
+
+
+def _with_fitted_noise(
+    targets: StructureTarget, noise: NoiseFit, drawn: StructureDraws
+) -> BlockDraws:
+    """Draws with the noise that their structures were fitted with."""
+    num_objects, num_structures = targets.structures.shape[:2]
     structure = drawn.structure.reshape(num_objects, -1)
-    z = drawn.z.reshape(*structure.shape, -1)
+    own = noise.take(np.arange(num_objects)[:, None] * num_structures + structure)
     return BlockDraws(
         structure=structure,
-        z=z,
+        z=drawn.z.reshape(*structure.shape, -1),
         log_density=drawn.log_density.reshape(structure.shape),
-        noise_scale=draw_noise_scales(noise_key, targets, structure, z),
+        noise_scale=own.reading,
+        impulse_scale=own.impulse,
         log_evidence=drawn.evidence.total,
         evidence=drawn.evidence,
         diagnostics=drawn.diagnostics,
-        chain_index=np.arange(num_chains),
+        chain_index=np.arange(drawn.structure.shape[1]),
     )
 
 
@@ -189,11 +233,12 @@ def _rehearse(
     """Go through all stages but the likelihood of many points, to compile them."""
     num_objects, num_structures = targets.structures.shape[:2]
     likelihood: Any = targets.log_likelihood
-    reading = np.asarray(likelihood.reference, float)[:1]
+    reading = np.asarray(likelihood.reference, float)[:1, 0]
     dim = targets.slot.shape[1]
     first = np.zeros(1, int)
     noise = NoiseFit(reading, reading[..., 2:])
-    filter_points(targets, first, first, np.zeros((1, dim)), noise)
+    for run in (filter_points, filter_densities):
+        run(targets, first, first, np.zeros((1, dim)), noise)
     num_modes = num_structures * settings.fit.num_modes
     dtype = targets.log_prior.dtype
     structure = np.repeat(np.arange(num_structures), settings.fit.num_modes)
@@ -244,23 +289,3 @@ def _diagnose(
         names = ("the chains' visits", "importance sampling")
         reasons += odds_disagree(shares, evidence, index, names)
     return verdict._replace(ok=not reasons, reasons=reasons)
-
-
-def draw_noise_scales(key: Key, targets: StructureTarget, structure, z) -> np.ndarray:
-    """Noise scales given every draw, from their inverse-gamma distribution."""
-    num_objects, num_draws = structure.shape
-    index = np.repeat(np.arange(num_objects), num_draws)
-    found = evaluate_points(
-        targets,
-        index,
-        structure.reshape(-1),
-        z.reshape(num_objects * num_draws, -1),
-    )
-    likelihood: Any = targets.log_likelihood
-    reference = np.asarray(likelihood.reference, float)
-    scale = np.asarray(likelihood.coordinates.scales.noise, float)[:, None] / reference
-    shape = NOISE_SHAPE + 0.5 * found.num
-    rate = scale[index] ** 2 + 0.5 * found.square
-    draws = host_generator(key).gamma(shape)
-    sd = reference[index] * np.sqrt(rate / draws)
-    return sd.astype(z.dtype).reshape(num_objects, num_draws, *sd.shape[1:])

@@ -14,6 +14,7 @@ Scale = Literal["identity", "log", "axial"]
 """Scale on which spread is judged; `axial`: an angle that is the same modulo pi."""
 
 CHANNELS = ("position", "angle", "velocity", "spin")
+IMPULSES = ("velocity_impulse", "spin_impulse")
 """Groups of readings that share a noise scale, in the order of the last axis."""
 
 _FEWEST_DRAWS = 5.0

@@ -113,9 +113,12 @@ def sample_tempered(
     for _ in range(_MAX_STEPS):
         log_ratio = _log_ratio(particles)
         step = np.array(
-            [_next_step(r, 1.0 - b) for r, b in zip(log_ratio, power, strict=True)]
+            [
+                next_step(r, 1.0 - b, _KEPT_SHARE)
+                for r, b in zip(log_ratio, power, strict=True)
+            ]
         )
-        log_weight = _times(step[:, None], log_ratio)
+        log_weight = times(step[:, None], log_ratio)
         by_island = log_weight.reshape(num_objects, _NUM_ISLANDS, num_particles)
         log_whole += np.logaddexp.reduce(by_island, axis=-1) - np.log(num_particles)
         power = np.where(step >= 1.0 - power, 1.0, power + step)
@@ -206,16 +209,22 @@ def _log_ratio(particles: Particles) -> np.ndarray:
     return np.where(np.isnan(ratio), -np.inf, ratio)
 
 
-def _times(power: np.ndarray | float, log_ratio: np.ndarray) -> np.ndarray:
+def times(power: np.ndarray | float, log_ratio: np.ndarray) -> np.ndarray:
     """A power of a ratio; zero to any power stays zero."""
     return np.where(np.isfinite(log_ratio), power * log_ratio, -np.inf)
 
 
-def _next_step(log_ratio: np.ndarray, left: float) -> float:
-    """Largest step of the power that keeps the effective sample size, by bisection."""
+def next_step(log_ratio: np.ndarray, left: float, kept_share: float) -> float:
+    """Largest step of the power that keeps the effective sample size, by bisection.
+
+    Args:
+        log_ratio: of the densities at powers one and zero, of each particle.
+        left: largest step that may be taken.
+        kept_share: of the particles, that the weights must count for.
+    """
 
     def size(step: float) -> float:
-        log_weight = _times(step, log_ratio)
+        log_weight = times(step, log_ratio)
         top = log_weight.max()
         if not np.isfinite(top):
             return float(log_ratio.size)
@@ -223,7 +232,7 @@ def _next_step(log_ratio: np.ndarray, left: float) -> float:
         return float(weight.sum() ** 2 / (weight**2).sum())
 
     # What fell outside the mixture's cells is lost at any step.
-    least = _KEPT_SHARE * np.isfinite(log_ratio).sum()
+    least = kept_share * np.isfinite(log_ratio).sum()
     if left <= 0.0 or size(left) >= least:
         return left
     low, high = 0.0, left

@@ -55,8 +55,13 @@ def to_arviz(posterior: Posterior) -> Any:
     def split(array: np.ndarray) -> np.ndarray:
         return array.reshape(num_chains, -1, *array.shape[1:])
 
-    numbers, dims = _variables(posterior, kept.params, kept.noise_scale)
-    prior, _ = _variables(posterior, kept.prior_params, kept.prior_noise_scale)
+    noise = {"noise_scale": kept.noise_scale, "impulse_scale": kept.impulse_scale}
+    numbers, dims = _variables(posterior, kept.params, noise)
+    prior_noise = {
+        "noise_scale": kept.prior_noise_scale,
+        "impulse_scale": kept.prior_impulse_scale,
+    }
+    prior, _ = _variables(posterior, kept.prior_params, prior_noise)
     groups = {
         "posterior": {name: split(array) for name, array in numbers.items()},
         "sample_stats": {
@@ -82,7 +87,7 @@ def _num_chains(chain: np.ndarray) -> int:
 
 
 def _variables(
-    posterior: Posterior, params: object, noise_scale: object
+    posterior: Posterior, params: object, noise: dict
 ) -> tuple[dict[str, np.ndarray], dict[str, list[str]]]:
     """Arrays by name, leading axis draw, and the names of their other axes."""
     params = jax.tree.map(np.asarray, params)
@@ -90,13 +95,15 @@ def _variables(
     numbers = {
         "density": params.density,
         "mass": params.density * area,
-        "noise_scale": np.asarray(noise_scale),
+        **{k: np.asarray(v) for k, v in noise.items() if v is not None},
     }
     dims = {
         "density": ["body"],
         "mass": ["body"],
         "noise_scale": ["body", "channel"],
     }
+    if "impulse_scale" in numbers:
+        dims["impulse_scale"] = ["body", "impulse"]
     slot_dims = {
         **{kind: [kind] for kind in JOINTS},
         "wheel": ["body", "wheel"],
@@ -127,6 +134,7 @@ def _coordinates(posterior: Posterior) -> dict[str, list]:
     return {
         "body": list(posterior.spec.names),
         "channel": list(CHANNELS),
+        "impulse": ["velocity", "spin"],
         "axis": ["x", "y"],
         "direction": ["rolling", "lateral"],
         **{

@@ -82,6 +82,7 @@ def draw_prediction(
         jnp.broadcast_to(history.action[rows], (count, *history.action[rows].shape)),
         jnp.broadcast_to(history.dt[rows], (count, num_steps)),
         jnp.arange(num_steps),
+        kept.impulse_scale,
     )
     time = np.concatenate([[0.0], np.cumsum(np.asarray(history.dt)[rows])])
     first = float(reading[body, column])

@@ -18,7 +18,8 @@ from boomdp_jax.inference.fit import (
     make_fits,
     normal_equations,
 )
-from boomdp_jax.inference.fit_noise import NoiseFit, fit_noise, with_gains
+from boomdp_jax.inference.fit_noise import fit_noise, with_gains
+from boomdp_jax.inference.noise_level import NoiseFit
 from boomdp_jax.inference.one_step import OneStepLikelihood
 from tests.inference.recordings import AREA, MASS, NOISE, box_scene, free_box
 
@@ -124,7 +125,7 @@ def test_noise_is_found(box):
     truth = np.log(MASS / AREA / 30.0) / 1.5
     best = make_fits(box, np.arange(2), np.zeros(2, int), np.full((2, 1), truth))
     start = NoiseFit(np.full((2, 1, 4), 1e-2), np.full((2, 1, 2), 4e-3))
-    noise = fit_noise(box, best, start)
+    noise = fit_noise(box, best, start).noise
     # 60 readings of one or two channels: the sd of a standard deviation is 6 to 9 %.
     expected = NOISE[[0, 2, 3, 5]]
     np.testing.assert_allclose(noise.reading[:, 0], np.tile(expected, (2, 1)), rtol=0.3)
@@ -150,7 +151,8 @@ def test_gains_belong_to_their_structure(wheeled):
     index, structure = np.repeat([0, 1], num), np.tile(np.arange(num), 2)
     z = np.where(Host.of(wheeled).in_use[structure], 0.3, 0.0)
     top = make_fits(wheeled, index, structure, z)
-    noise = NoiseFit(np.tile(NOISE[[0, 2, 3, 5]], (2, 1, 1)), np.full((2, 1, 2), 1e-4))
+    reading = np.tile(NOISE[[0, 2, 3, 5]], (2 * num, 1, 1))
+    noise = NoiseFit(reading, np.full((2 * num, 1, 2), 1e-4))
     tracked = with_gains(wheeled, top, noise)
     gains = tracked.log_likelihood.gains
     assert gains.first.shape[:2] == (2, num)

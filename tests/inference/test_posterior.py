@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from boomdp_jax.inference.posterior import Posterior, add_reading_noise
+from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.random_motion import add_reading_noise
 from boomdp_jax.physics import State, empty_params
 from tests.inference.posteriors import (
     draws_like,

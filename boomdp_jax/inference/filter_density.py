@@ -1,0 +1,85 @@
+r"""Marginal likelihood of noisy readings by an extended Kalman filter, for many points.
+
+The same filter as `kalman.extended_filter`, whose docstring has the equations, but no
+gains are kept and nothing is factorised: readings are taken one channel at a time, as
+noise of one channel is independent of that of the next (Bierman 1977, Factorization
+methods for discrete sequential estimation).
+"""
+
+import jax
+import jax.numpy as jnp
+
+from boomdp_jax.core.arrays import FloatScalar
+from boomdp_jax.inference.filter_update import correct, move_and_correct
+from boomdp_jax.inference.kalman import (
+    NoiseLevel,
+    channel_scale,
+    kick_scale,
+    start_scale,
+)
+from boomdp_jax.inference.track_data import TrackData
+from boomdp_jax.inference.tracking import channel_difference, predictor
+from boomdp_jax.physics.params import Params
+from boomdp_jax.physics.scene import Scene
+
+
+def filter_density(
+    scene: Scene, params: Params, data: TrackData, noise: NoiseLevel
+) -> FloatScalar:
+    """Log-density of all readings but the first of each track.
+
+    Args:
+        scene: the block's scene.
+        params: the hypothesis.
+        data: the block's readings.
+        noise: of readings and motion.
+
+    Returns:
+        The same as `extended_filter` gives. To be batched by `jax.vmap`.
+    """
+    steps = data.steps
+    predict = predictor(scene, params, steps.dt)
+    num_bodies = steps.state.shape[1]
+    num = 6 * num_bodies
+    scale = channel_scale(noise.reading).reshape(-1)
+    unknown = start_scale(num_bodies)
+    variance, kick = scale**2, kick_scale(noise.impulse).reshape(-1) ** 2
+    offsets = jnp.diag(scale).reshape(num, num_bodies, 6)
+
+    def advance(carry, row):
+        state, covariance, total = carry
+        is_start, is_second, start, first, first_mask, action, last, last_mask, dt = row
+        seen = first_mask.reshape(-1)
+        at_start = jnp.diag(jnp.where(seen > 0, scale, unknown) ** 2)
+        state = jnp.where(is_start > 0, start, state)
+        covariance = jnp.where(is_start > 0, at_start, covariance)
+        miss = channel_difference(first, state).reshape(-1)
+        shift, covariance, density = correct(
+            covariance, miss, is_second * seen, variance
+        )
+        state = state + shift.reshape(state.shape)
+        total = total + density
+        points = jnp.concatenate([state[None], state[None] + offsets])
+        images = jax.vmap(lambda x: predict(x, action, dt))(points)
+        state = images[0]
+        rise = (images[1:] - state[None]).reshape(num, num)
+        miss = channel_difference(last, state).reshape(-1)
+        shift, covariance, density = move_and_correct(
+            covariance, rise, scale, kick, miss, last_mask.reshape(-1), variance
+        )
+        state = state + shift.reshape(state.shape)
+        return (state, covariance, total + density), None
+
+    rows = (
+        data.is_start,
+        data.is_second,
+        data.start,
+        steps.state,
+        data.first_mask,
+        steps.action,
+        steps.next_state,
+        data.last_mask,
+        steps.dt if steps.dt.ndim else None,
+    )
+    carry = (jnp.zeros((num_bodies, 6)), jnp.eye(num), jnp.zeros(()))
+    return jax.lax.scan(advance, carry, rows)[0][2]

@@ -1,0 +1,328 @@
+r"""From draws under a filter with fixed gains to draws with the noise inferred.
+
+Gains that are fixed for a structure make a hypothesis cheap, but they take the ratios
+of noises as known. Here each draw (k, z) is given noise $\eta$ from a proposal q that
+is fitted to its structure, and all go from
+
+$$p_0 = p_f(k, z \mid h)\,q(\eta \mid k) \quad\text{to}\quad
+  p_1 \propto p(k, z)\,p(\eta)\,L(h \mid k, z, \eta)$$
+
+through $p_0^{1-\beta} p_1^\beta$, where p_f is the posterior with fixed gains and L the
+marginal likelihood of the extended filter that uses $\eta$. Each step keeps the
+effective sample size of its weights at a given share, resamples, and moves coordinates
+and noise of every draw by Metropolis steps within its structure (Del Moral, Doucet and
+Jasra 2006, Sequential Monte Carlo samplers). Where the fixed gains were right that is
+one step. Structures change their probability by the mean weight of their draws.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from boomdp_jax.inference.evaluate import evaluate_points, log_prior_density
+from boomdp_jax.inference.filter_points import filter_densities
+from boomdp_jax.inference.fit import Fits, Host
+from boomdp_jax.inference.noise_level import NoiseFit, log_noise_prior
+from boomdp_jax.inference.noise_proposal import NoiseProposal
+from boomdp_jax.inference.resampling import systematic
+from boomdp_jax.inference.structure_evidence import StructureEvidence
+from boomdp_jax.inference.target import StructureTarget
+from boomdp_jax.inference.tempered_smc import next_step, times
+
+_KEPT_SHARE = 0.5
+_MAX_STEPS = 20
+_MOVES_BETWEEN, _LAST_MOVES = 1, 2
+# Lengths of steps relative to the best for a normal density, tried in turn.
+_STEP_SIZES = (1.0, 0.4)
+# Draws of a group from which its spread is taken.
+_LEAST_GROUP = 4
+# Distinct draws that are left of all, below which a result is doubted.
+_LEAST_LEFT = 0.02
+
+
+class Corrected(NamedTuple):
+    """Draws of equal weight that follow the joint posterior; on the host."""
+
+    structure: np.ndarray
+    """`[object, chain, draw]`."""
+    z: np.ndarray
+    noise: NoiseFit
+    """`[object * chain * draw, ...]`."""
+    log_density: np.ndarray
+    """Of structure, coordinates, noise and readings, `[object, chain, draw]`."""
+    evidence: StructureEvidence
+    sample_size: np.ndarray
+    """Draws that the first weights count for, `[object]`."""
+    reasons: list[list[str]]
+
+
+class _Draws(NamedTuple):
+    """A flat list, chain after chain, object after object."""
+
+    structure: np.ndarray
+    z: np.ndarray
+    vector: np.ndarray
+    group: np.ndarray
+    log_first: np.ndarray
+    log_last: np.ndarray
+    root: np.ndarray
+    """Which draw it comes from."""
+
+    def take(self, rows: np.ndarray) -> "_Draws":
+        """Some of them."""
+        return _Draws(*(part[rows] for part in self))
+
+    def where(self, condition: np.ndarray, other: "_Draws") -> "_Draws":
+        """Those of this list where a condition holds, else of another."""
+        return _Draws(
+            *(
+                np.where(condition.reshape(-1, *(1 for _ in a.shape[1:])), a, b)
+                for a, b in zip(self, other, strict=True)
+            )
+        )
+
+
+def infer_noise(
+    rng: np.random.Generator,
+    targets: StructureTarget,
+    start: NoiseFit,
+    structure: np.ndarray,
+    z: np.ndarray,
+    log_density: np.ndarray,
+    evidence: StructureEvidence,
+) -> Corrected:
+    """Take draws under fixed gains to draws with the noise inferred.
+
+    Args:
+        rng: source of randomness.
+        targets: stacked along a leading object axis.
+        start: noise of every structure of every object, in order.
+        structure: of each draw, `[object, chain, draw]`.
+        z: coordinates of each.
+        log_density: of each, under the targets.
+        evidence: of every structure, under the targets.
+
+    Returns:
+        As many draws, in chains that never exchange any.
+    """
+    num_objects, num_chains, num_each = structure.shape
+    problem = _Problem(targets, np.repeat(np.arange(num_objects), structure[0].size))
+    draws = problem.start(rng, start, structure, z, log_density)
+    power, steps = np.zeros(num_objects), 0
+    log_share = np.zeros((num_objects, num_chains))
+    before = draws.structure
+    first_size = np.zeros(num_objects)
+    while np.any(power < 1.0) and steps < _MAX_STEPS:
+        ratio = _ratio(draws).reshape(num_objects, -1)
+        step = np.array(
+            [
+                next_step(r, 1.0 - b, _KEPT_SHARE)
+                for r, b in zip(ratio, power, strict=True)
+            ]
+        )
+        if steps == 0:
+            first_size = np.array([_size(each) for each in ratio])
+        log_weight = times(step[:, None], ratio).reshape(num_objects, num_chains, -1)
+        log_share += np.logaddexp.reduce(log_weight, axis=-1) - np.log(num_each)
+        power = np.where(step >= 1.0 - power, 1.0, power + step)
+        draws = draws.take(_resample(rng, log_weight))
+        steps += 1
+        is_last = np.all(power >= 1.0)
+        for number in range(_LAST_MOVES if is_last else _MOVES_BETWEEN):
+            size = _STEP_SIZES[(steps + number) % len(_STEP_SIZES)]
+            draws = problem.move(rng, draws, power, size)
+    shape = structure.shape
+    changed = _changed(
+        evidence,
+        before.reshape(shape),
+        draws.structure.reshape(shape),
+        log_share,
+        np.asarray(targets.log_prior, float),
+    )
+    left = np.array([len(np.unique(r)) for r in draws.root.reshape(num_objects, -1)])
+    reasons: list[list[str]] = [[] for _ in range(num_objects)]
+    for i in range(num_objects):
+        if power[i] < 1.0:
+            reasons[i].append(
+                f"inferring the noise ended at a power of {power[i]:.3g}, not at 1"
+            )
+        if left[i] < _LEAST_LEFT * structure[0].size:
+            reasons[i].append(
+                f"inferring the noise left {left[i]} of {structure[0].size} draws"
+            )
+    return Corrected(
+        structure=draws.structure.reshape(shape),
+        z=draws.z.reshape(*shape, -1),
+        noise=NoiseFit.of_vector(draws.vector),
+        log_density=draws.log_last.reshape(shape),
+        evidence=changed,
+        sample_size=first_size,
+        reasons=reasons,
+    )
+
+
+class _Problem:
+    """Densities and moves of a list of draws."""
+
+    def __init__(self, targets: StructureTarget, index: np.ndarray):
+        likelihood: Any = targets.log_likelihood
+        self._targets, self._index = targets, index
+        scale = np.asarray(likelihood.coordinates.scales.noise, float)
+        self._scale = scale[index]
+        self._host = Host.of(targets)
+        self._proposal: NoiseProposal
+
+    def start(self, rng, start: NoiseFit, structure, z, log_density) -> _Draws:
+        """Draws with noise from the proposals, which are fitted first."""
+        num_structures = self._targets.structures.shape[1]
+        structure = structure.reshape(-1)
+        z = z.reshape(len(structure), -1).astype(float)
+        value = log_density.reshape(-1).astype(float)
+        name = self._index * num_structures + structure
+        names, group = np.unique(name, return_inverse=True)
+        fits = Fits(self._index, structure, z, value, np.zeros((len(z), 0, 0)))
+        self._proposal = NoiseProposal.fit(
+            self._targets, fits, group, start.take(names)
+        )
+        vector = self._proposal.sample(rng, group)
+        first = value + self._proposal.log_density(vector, group)
+        last = self._log_last(structure, z, vector)
+        root = np.arange(len(z))
+        return _Draws(structure, z, vector, group, first, last, root)
+
+    def move(self, rng, draws: _Draws, power: np.ndarray, size: float) -> _Draws:
+        """One Metropolis step of every draw, along the spread of its group."""
+        power = power[self._index]
+        step = self._steps(rng, draws, size)
+        dim = draws.z.shape[1]
+        z = self._host.wrap(draws.z + step[:, :dim])
+        vector = draws.vector + step[:, dim:]
+        last = self._log_last(draws.structure, z, vector)
+        first = np.zeros_like(last)
+        if np.any(power < 1.0):
+            found = evaluate_points(self._targets, self._index, draws.structure, z)
+            first = found.log_density
+            first = first + self._proposal.log_density(vector, draws.group)
+        trial = draws._replace(z=z, vector=vector, log_first=first, log_last=last)
+        gain = _tempered(trial, power) - _tempered(draws, power)
+        is_accepted = np.log(rng.random(len(gain))) < gain
+        return trial.where(is_accepted, draws)
+
+    def _log_last(self, structure, z, vector) -> np.ndarray:
+        noise = NoiseFit.of_vector(vector)
+        value = filter_densities(self._targets, self._index, structure, z, noise)
+        value = value + log_prior_density(self._targets, self._index, structure, z)
+        return value + log_noise_prior(self._scale, vector)
+
+    def _steps(self, rng, draws: _Draws, size: float) -> np.ndarray:
+        """Differences of two draws of the group, stretched at random.
+
+        Ter Braak (2006), A Markov chain Monte Carlo version of differential evolution.
+        """
+        order = np.argsort(draws.group, kind="stable")
+        num = np.bincount(draws.group)[draws.group]
+        begin = np.searchsorted(draws.group[order], draws.group)
+        pick = [
+            order[begin + (rng.random(len(num)) * num).astype(int)] for _ in range(2)
+        ]
+        dim = self._host.in_use.sum(axis=1)[draws.structure] + draws.vector.shape[1]
+        size = size * 2.38 / np.sqrt(2.0 * dim)[:, None]
+        both = np.concatenate([draws.z, draws.vector], axis=1)
+        step = both[pick[0]] - both[pick[1]]
+        dim = draws.z.shape[1]
+        step[:, :dim] = self._host.wrap(step[:, :dim])
+        stretch = size * np.exp(rng.standard_normal((len(num), 1)) * 0.5)
+        return np.where((num >= _LEAST_GROUP)[:, None], stretch * step, 0.0)
+
+
+def _ratio(draws: _Draws) -> np.ndarray:
+    ratio = draws.log_last - draws.log_first
+    return np.where(np.isfinite(ratio), ratio, -np.inf)
+
+
+def _tempered(draws: _Draws, power: np.ndarray) -> np.ndarray:
+    first = np.where(power < 1.0, (1.0 - power) * draws.log_first, 0.0)
+    value = first + times(power, draws.log_last)
+    return np.where(np.isnan(value), -np.inf, value)
+
+
+def _resample(rng: np.random.Generator, log_weight: np.ndarray) -> np.ndarray:
+    """Rows of the chosen draws, chain by chain, in random order."""
+    num_objects, num_chains, num = log_weight.shape
+    top = log_weight.max(axis=-1, keepdims=True)
+    is_lost = ~np.isfinite(top)
+    weight = np.where(is_lost, 1.0, np.exp(log_weight - np.where(is_lost, 0.0, top)))
+    rows = []
+    for i, c in np.ndindex(num_objects, num_chains):
+        begin = (i * num_chains + c) * num
+        rows.append(begin + rng.permutation(systematic(rng, weight[i, c], num)))
+    return np.concatenate(rows)
+
+
+def _size(log_weight: np.ndarray) -> float:
+    """Draws that weights count for."""
+    top = log_weight.max()
+    if not np.isfinite(top):
+        return 0.0
+    weight = np.exp(log_weight - top)
+    return float(weight.sum() ** 2 / (weight**2).sum())
+
+
+def _changed(
+    evidence: StructureEvidence,
+    before: np.ndarray,
+    after: np.ndarray,
+    log_share: np.ndarray,
+    log_prior: np.ndarray,
+) -> StructureEvidence:
+    """Evidence times the mean weight of each structure's draws.
+
+    Args:
+        evidence: with fixed gains.
+        before: structure of each draw, `[object, chain, draw]`.
+        after: the same at the end.
+        log_share: log of the product of mean weights, `[object, chain]`.
+        log_prior: of each structure, `[object, structure]`.
+
+    Returns:
+        The same of the filter with inferred noise. Structures without draws keep
+        their odds against all others together; their errors are not known.
+    """
+    num = evidence.probability.shape[1]
+    names = np.arange(num)
+    share = np.mean(before[..., None] == names, axis=2)
+    mass = np.mean(after[..., None] == names, axis=2)
+    # Chains start with draws of their own, which the ratio makes up for.
+    top = log_share.max(axis=1, keepdims=True)
+    mass = mass * np.exp(log_share - top)[..., None]
+    pooled = share.mean(axis=1)
+    has_draws = pooled > 0
+    factor = mass.mean(axis=1) / np.where(has_draws, pooled, 1.0)
+    residual = mass - factor[:, None] * share
+    num_chains = before.shape[1]
+    spread = np.sqrt((residual**2).sum(axis=1) / (num_chains * max(num_chains - 1, 1)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        own = spread / np.where(has_draws, pooled, np.nan) / factor
+        whole = np.log(np.sum(evidence.probability * factor, axis=1)) - np.log(
+            np.sum(evidence.probability * has_draws, axis=1)
+        )
+        log_factor = np.where(has_draws, np.log(factor), whole[:, None]) + top
+    log_evidence = evidence.log_evidence + log_factor
+    joint = log_evidence + log_prior
+    total = np.logaddexp.reduce(joint, axis=1)
+    probability = np.exp(joint - total[:, None])
+    error = np.hypot(evidence.error, own)
+    # To first order, errors of structures independent of each other.
+    each = np.nan_to_num(probability * own)
+    rest = np.sqrt(np.sum(each**2, axis=1, keepdims=True))
+    return StructureEvidence(
+        log_evidence=log_evidence,
+        error=error,
+        probability=probability,
+        probability_error=np.sqrt(
+            evidence.probability_error**2
+            + ((1.0 - 2.0 * probability) * each**2 + probability**2 * rest**2)
+        ),
+        total=total,
+        total_error=np.hypot(evidence.total_error, rest[:, 0]),
+    )
