@@ -23,7 +23,7 @@ _CAPACITY = 50
 _NUM_EPISODES = 4
 _CHANNEL = np.array([0, 0, 1, 2, 2, 3])
 
-_PRIOR_SD = {"log": 1.5, "length": 1.0, "angle": 1.0, "offset": 1.0}
+PRIOR_SD = {"log": 1.5, "length": 1.0, "angle": 1.0, "offset": 1.0}
 """Of a number's logarithm, a place [m], a heading [rad], friction [N m s/rad]."""
 
 
@@ -76,7 +76,7 @@ def _episodes(table: TransitionTable, is_chained: bool) -> tuple[np.ndarray, ...
 @jax.jit
 def _information(scene: Scene, params: Params, starts, wrenches, weights) -> jax.Array:
     """Information about the numbers of the structure, starts marginalised out."""
-    kinds, base = _free_numbers(params)
+    kinds, base = free_numbers(params)
     num_free = len(kinds)
     pinned = params.revolute.active.shape[0] > 0
 
@@ -110,11 +110,11 @@ def _information(scene: Scene, params: Params, starts, wrenches, weights) -> jax
         return both[:num_free, :num_free] - cross @ jnp.linalg.solve(own, cross.T)
 
     total = jnp.sum(jax.vmap(one_episode)(starts, wrenches, weights), axis=0)
-    prior = jnp.array([_PRIOR_SD[kind] ** -2 for kind in kinds])
+    prior = jnp.array([PRIOR_SD[kind] ** -2 for kind in kinds])
     return total + jnp.diag(prior)
 
 
-def _free_numbers(params: Params):
+def free_numbers(params: Params):
     """Kind of each free number, and the params that offsets from the truth make."""
     kinds, changes = ["log"], []
     fields = {

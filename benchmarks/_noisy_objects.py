@@ -11,10 +11,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _information import _PRIOR_SD, _free_numbers
+from _information import PRIOR_SD, free_numbers
 
 from boomdp_jax.core.transition_table import TransitionTable
 from boomdp_jax.inference.kalman import NoiseLevel, extended_filter
+from boomdp_jax.inference.summary import axial_difference
 from boomdp_jax.inference.track_data import TrackData, track_data
 from boomdp_jax.inference.tracking import Gains, innovations, one_step_gains
 from boomdp_jax.interop.object_families import random_object, record_random_pushes
@@ -104,24 +105,25 @@ def _roll(scene: Scene, params: Params, first, is_start, wrenches, kicks):
     return jax.lax.scan(advance, jnp.zeros(6), rows)[1]
 
 
-class Rival(NamedTuple):
-    """An estimate of an object's free numbers, as offsets from the truth."""
+class Estimate(NamedTuple):
+    """A guess of an object's free numbers, as offsets from the truth."""
 
     offset: np.ndarray
-    sd: np.ndarray
+    covariance: np.ndarray
 
 
-def bounds_and_rivals(
-    item: NoisyObject,
-) -> tuple[list[str], np.ndarray, dict[str, Rival]]:
-    """The Cramér-Rao bound, and what one-step and open-loop likelihoods make of it.
+class Bounds(NamedTuple):
+    """The least covariance of an object's free numbers, and what rivals make of it."""
 
-    Structure and noise are known. The bound is that of the extended filter at the
-    truth. Both rivals start at the truth and take their own scale of the residuals.
+    covariance: np.ndarray
+    """Cramér-Rao bound: that of the extended filter at the truth."""
+    rivals: dict[str, Estimate]
+    """One-step and open-loop least squares, started at the truth, with scales of the
+    residuals of their own."""
 
-    Returns:
-        Names of the free numbers, their least sd, rivals by name.
-    """
+
+def bounds_and_rivals(item: NoisyObject) -> Bounds:
+    """Structure and noise are known to the bound; the structure to the rivals."""
     with jax.enable_x64(True):
         data = track_data(item.table.to_history(), (0,), True)
         data = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), data)
@@ -129,40 +131,75 @@ def bounds_and_rivals(
         noise = NoiseLevel(jnp.asarray(item.reading)[None], jnp.asarray(impulse)[None])
         scene, params = item.truth.scene, item.truth.params()
         gains = _true_gains(scene, params, data, noise)
-        names, base = free_names(params)
-        bound = np.asarray(_bound(scene, params, data, gains))
-        scale = item.reading[_CHANNEL][None]
-        ones = one_step_gains(data, scale)
+        ones = one_step_gains(data, item.reading[_CHANNEL][None])
         ones = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), ones)
         never = eqx.tree_at(lambda g: g.first, ones, jnp.zeros_like(ones.first))
-        rivals = {
-            "one-step": _least_squares(scene, params, data, ones),
-            "open-loop": _least_squares(scene, params, data, never),
-        }
-    return names, bound, rivals
+        return Bounds(
+            np.asarray(_bound(scene, params, data, gains)),
+            {
+                "one-step": _least_squares(scene, params, data, ones),
+                "open-loop": _least_squares(scene, params, data, never),
+            },
+        )
 
 
-def free_names(params: Params) -> tuple[list[str], object]:
-    """Names of the free numbers of a structure, in the order of `_free_numbers`."""
-    names = ["mass"]
-    fields = {
-        "revolute": (
-            ("pin x on the body", "pin y on the body"),
-            ("pin x in the world", "pin y in the world"),
-            ("pin friction",),
-        ),
-        "wheel": (
-            ("wheel x", "wheel y"),
-            ("wheel heading",),
-            ("rolling viscous", "lateral viscous"),
-            ("rolling dry", "lateral dry"),
-        ),
-        "ground": (("ground friction",), ("ground viscous",)),
-    }
-    for group, parts in fields.items():
-        if getattr(params, group).active.size:
-            names += [name for part in parts for name in part]
-    return names, _free_numbers(params)[1]
+class Quantity(NamedTuple):
+    """A number that an object is judged by."""
+
+    name: str
+    direction: np.ndarray
+    """How it depends on offsets of the free numbers."""
+
+
+def quantities(item: NoisyObject) -> list[Quantity]:
+    """Mass, pin and wheel, in the order of `_information.free_numbers`.
+
+    A wheel's place counts across its axle only, along which it can slide unseen.
+    """
+    params = jax.tree.map(np.asarray, item.truth.params())
+    num = len(free_numbers(params)[0])
+    unit = np.eye(num)
+    out = [Quantity("log mass", unit[0])]
+    if item.family == "table":
+        names = ("pin x on the body", "pin y on the body", "pin x in the world")
+        names = (*names, "pin y in the world")
+        out += [Quantity(name, unit[1 + i]) for i, name in enumerate(names)]
+    if item.family == "cart":
+        heading = float(params.wheel.heading[0, 0])
+        along = np.cos(heading) * unit[1] + np.sin(heading) * unit[2]
+        out += [
+            Quantity("axle line offset", along),
+            Quantity("wheel heading", unit[3]),
+            Quantity("log rolling friction", unit[4]),
+            Quantity("log lateral friction", unit[5]),
+        ]
+    return out
+
+
+def offsets_of_draws(item: NoisyObject, params: Params) -> np.ndarray:
+    """Draws of the object's own structure as offsets from the truth.
+
+    Args:
+        item: the object.
+        params: draws on the host, leading axis draw, that have the true structure.
+
+    Returns:
+        `[draw, number]`, columns as in `quantities`; those that no quantity uses are
+        zero.
+    """
+    truth = jax.tree.map(np.asarray, item.truth.params())
+    out = np.zeros((len(params.density), len(free_numbers(truth)[0])))
+    out[:, 0] = np.log(params.density[:, 0] / truth.density[0])
+    if item.family == "table":
+        out[:, 1:3] = params.revolute.anchor_a[:, 0] - truth.revolute.anchor_a[0]
+        out[:, 3:5] = params.revolute.anchor_b[:, 0] - truth.revolute.anchor_b[0]
+    if item.family == "cart":
+        wheel, right = params.wheel, truth.wheel
+        out[:, 1:3] = wheel.position[:, 0, 0] - right.position[0, 0]
+        out[:, 3] = axial_difference(wheel.heading[:, 0, 0], right.heading[0, 0])
+        viscous, least = wheel.viscous[:, 0, 0], np.finfo(np.float32).tiny
+        out[:, 4:6] = np.log(np.maximum(viscous, least) / right.viscous[0, 0])
+    return out
 
 
 @jax.jit
@@ -171,16 +208,16 @@ def _true_gains(scene, params, data: TrackData, noise: NoiseLevel) -> Gains:
 
 
 def _residual(scene, params, data, gains):
-    _, base = _free_numbers(params)
+    _, base = free_numbers(params)
     return lambda free: innovations(scene, base(free), data, gains).reshape(-1)
 
 
 @jax.jit
 def _bound(scene, params, data, gains):
-    kinds, _ = _free_numbers(params)
+    kinds, _ = free_numbers(params)
     jacobian = jax.jacfwd(_residual(scene, params, data, gains))(jnp.zeros(len(kinds)))
-    prior = jnp.diag(jnp.array([_PRIOR_SD[kind] ** -2 for kind in kinds]))
-    return jnp.sqrt(jnp.diagonal(jnp.linalg.inv(jacobian.T @ jacobian + prior)))
+    prior = jnp.diag(jnp.array([PRIOR_SD[kind] ** -2 for kind in kinds]))
+    return jnp.linalg.inv(jacobian.T @ jacobian + prior)
 
 
 @jax.jit
@@ -195,18 +232,18 @@ def _normal_equations(scene, params, data, gains, free):
     num = jax.ops.segment_sum(counts, group, 4)
     square = jax.ops.segment_sum(jnp.sum(table**2, axis=0), group, 4)
     weight = jnp.tile((num / jnp.maximum(square, 1e-30))[group], table.shape[0])
-    kinds, _ = _free_numbers(params)
-    prior = jnp.array([_PRIOR_SD[kind] ** -2 for kind in kinds])
+    kinds, _ = free_numbers(params)
+    prior = jnp.array([PRIOR_SD[kind] ** -2 for kind in kinds])
     matrix = (jacobian.T * weight) @ jacobian + jnp.diag(prior)
     gradient = jacobian.T @ (weight * value) + prior * free
     return matrix, gradient, 0.5 * jnp.sum(num * jnp.log(square + 1e-30))
 
 
-def _least_squares(scene, params, data, gains) -> Rival:
-    kinds, _ = _free_numbers(params)
+def _least_squares(scene, params, data, gains) -> Estimate:
+    kinds, _ = free_numbers(params)
     free, damping = jnp.zeros(len(kinds)), 1e-3
     matrix, gradient, cost = _normal_equations(scene, params, data, gains, free)
-    prior = np.array([_PRIOR_SD[kind] ** -2 for kind in kinds])
+    prior = np.array([PRIOR_SD[kind] ** -2 for kind in kinds])
     for _ in range(30):
         damped = matrix + damping * jnp.diag(jnp.diagonal(matrix))
         trial = free - jnp.linalg.solve(damped, gradient)
@@ -218,4 +255,4 @@ def _least_squares(scene, params, data, gains) -> Rival:
                 break
         else:
             damping *= 5
-    return Rival(np.asarray(free), np.sqrt(np.diagonal(np.linalg.inv(matrix))))
+    return Estimate(np.asarray(free), np.linalg.inv(np.asarray(matrix)))

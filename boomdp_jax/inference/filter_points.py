@@ -22,10 +22,10 @@ _POINTS_PER_CALL = 8
 
 @QuickCompile
 def _gather(targets: StructureTarget, index, structure):
-    bare = without_gains(targets.log_likelihood)
-    return jax.tree.map(lambda leaf: leaf[index], bare), targets.structures[
-        index, structure
-    ]
+    likelihood: Any = targets.log_likelihood
+    bare = without_gains(likelihood)
+    likelihoods = jax.tree.map(lambda leaf: leaf[index], bare)
+    return likelihoods, targets.structures[index[:, None], structure]
 
 
 @QuickCompile
@@ -35,11 +35,11 @@ def _densities(likelihoods, active, z, noise: NoiseLevel):
     def one_chunk(likelihood, active, z, noise):
         coordinates = likelihood.coordinates
 
-        def one_point(z, noise):
+        def one_point(active, z, noise):
             params = coordinates(z, active)
             return filter_density(coordinates.scene, params, likelihood.data, noise)
 
-        return jax.vmap(one_point)(z, noise)
+        return jax.vmap(one_point)(active, z, noise)
 
     return jax.vmap(one_chunk)(likelihoods, active, z, noise)
 
@@ -72,11 +72,19 @@ def filter_densities(
     Returns:
         `[point]`, minus infinity where the filter's result is not finite.
     """
-    chunks = Chunking.of(index, structure, targets.structures.shape[1])
+    # Nothing here belongs to a structure as gains do: chunks are of one object.
+    chunks = Chunking.of(index, np.zeros_like(structure), 1)
     calls = call_each(
         _densities_on_host,
         [
-            (targets, *owner, z[rows], noise.reading[rows], noise.impulse[rows])
+            (
+                targets,
+                owner[0],
+                structure[rows],
+                z[rows],
+                noise.reading[rows],
+                noise.impulse[rows],
+            )
             for owner, rows in chunks.calls()
         ],
         targets,

@@ -48,6 +48,7 @@ class FilteredLikelihood(eqx.Module):
         self, z: Float[Array, " dim"], active: Bool[Array, " slot"]
     ) -> FloatScalar:
         """Log marginal likelihood, -1e30 where the prediction is not finite."""
+        assert self.reference is not None
         structure = self.structure_index(active)
         gains = self.gains_of(structure)
         found = self.innovations(z, active, gains)

@@ -36,6 +36,8 @@ _START_NOISE = 3.0
 # Structures of a lone body whose noise is fitted, the most probable ones; the work
 # grows with the square of the number of channels.
 _MOST_FITTED = 8
+# So many nats below the best a structure is out of the question.
+_HOPELESS = 40.0
 
 
 class Found(NamedTuple):
@@ -74,7 +76,7 @@ def find_modes(
     for number in range(_NUM_ROUNDS):
         report(f"fitting noise and filters, round {number + 1} of {_NUM_ROUNDS}")
         top = best_of_each(fits, num_structures, 1)
-        noise = _noise_of_structures(targets, top, noise)
+        noise = _noise_of_structures(targets, top, noise, number > 0)
         targets = with_gains(targets, top, noise)
         again = make_fits(targets, fits.index, fits.structure, fits.z)
         again = best_of_each(again, num_structures, settings.num_starts)
@@ -140,26 +142,39 @@ def _first_noise(targets: StructureTarget, top: Fits) -> NoiseFit:
 
 
 def _noise_of_structures(
-    targets: StructureTarget, top: Fits, start: NoiseFit
+    targets: StructureTarget, top: Fits, start: NoiseFit, has_filters: bool
 ) -> NoiseFit:
     """Noise of the most probable structures; the others get that of the best.
+
+    Structures that are out of the question do not get their own either, once there are
+    filters to tell so.
 
     Args:
         targets: stacked along a leading object axis.
         top: one fit of every structure of every object, in order.
         start: where to start for each of them.
+        has_filters: whether the fits are of filters, or of single steps.
     """
     evidence = _laplace_evidence(targets, top)
     num_objects, num_structures = evidence.shape
     num_bodies = start.reading.shape[1]
     num_fitted = min(max(1, _MOST_FITTED // num_bodies**2), num_structures)
     order = np.argsort(-evidence, axis=1, kind="stable")[:, :num_fitted]
-    chosen = (np.arange(num_objects)[:, None] * num_structures + order).reshape(-1)
-    peaks = fit_noise(targets, top.take(chosen), start.take(chosen))
-    vector = peaks.noise.vector.reshape(num_objects, num_fitted, -1)
-    out = np.repeat(vector[:, :1], num_structures, axis=1).reshape(len(top.z), -1)
-    out[chosen] = vector.reshape(len(chosen), -1)
-    return NoiseFit.of_vector(out)
+    gap = evidence.max(axis=1, keepdims=True) - np.take_along_axis(evidence, order, 1)
+    is_asked = (gap < _HOPELESS) | (not has_filters)
+    is_asked[:, 0] = True
+    chosen = np.arange(num_objects)[:, None] * num_structures + order
+    rows = chosen[is_asked]
+    peaks = fit_noise(targets, top.take(rows), start.take(rows))
+    vector = start.vector.reshape(num_objects, num_structures, -1)
+    out = vector.reshape(len(top.z), -1).copy()
+    out[rows] = peaks.noise.vector
+    best = out[chosen[:, 0]]
+    out = out.reshape(vector.shape)
+    is_left = np.ones(evidence.shape, bool)
+    is_left.reshape(-1)[rows] = False
+    out = np.where(is_left[..., None], best[:, None], out)
+    return NoiseFit.of_vector(out.reshape(len(top.z), -1))
 
 
 def _laplace_evidence(targets: StructureTarget, top: Fits) -> np.ndarray:

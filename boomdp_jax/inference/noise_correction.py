@@ -32,6 +32,8 @@ from boomdp_jax.inference.tempered_smc import next_step, times
 _KEPT_SHARE = 0.5
 _MAX_STEPS = 20
 _MOVES_BETWEEN, _LAST_MOVES = 1, 2
+# Where the first weights count for this share of the draws one move will do.
+_GOOD_SHARE = 0.5
 # Lengths of steps relative to the best for a normal density, tried in turn.
 _STEP_SIZES = (1.0, 0.4)
 # Draws of a group from which its spread is taken.
@@ -128,7 +130,9 @@ def infer_noise(
         draws = draws.take(_resample(rng, log_weight))
         steps += 1
         is_last = np.all(power >= 1.0)
-        for number in range(_LAST_MOVES if is_last else _MOVES_BETWEEN):
+        is_easy = steps == 1 and np.all(first_size > _GOOD_SHARE * structure[0].size)
+        num_moves = _LAST_MOVES if is_last and not is_easy else _MOVES_BETWEEN
+        for number in range(num_moves):
             size = _STEP_SIZES[(steps + number) % len(_STEP_SIZES)]
             draws = problem.move(rng, draws, power, size)
     shape = structure.shape
