@@ -14,9 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool
 
-from boomdp_jax.core.arrays import on_device
-from boomdp_jax.core.quick_compile import QuickCompile
-from boomdp_jax.core.side_by_side import call_each
+from boomdp_jax.core.spread import Program, run_each
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.tracking import Gains
 
@@ -45,16 +43,15 @@ class _Chunks(NamedTuple):
     active: Bool[Array, "chunk slot"]
 
 
-@QuickCompile
-def _gather(targets: StructureTarget, index, structure) -> _Chunks:
+def _gather(targets: StructureTarget, index, structure, z) -> tuple[_Chunks, Any]:
+    """What chunks need of the targets, which alone knows how many objects there are."""
     likelihood: Any = targets.log_likelihood
     gains = jax.tree.map(lambda leaf: leaf[index, structure], likelihood.gains)
     bare = eqx.tree_at(lambda x: (x.gains, x.structures), likelihood, (None, None))
     bare = jax.tree.map(lambda leaf: leaf[index], bare)
-    return _Chunks(bare, gains, targets.structures[index, structure])
+    return _Chunks(bare, gains, targets.structures[index, structure]), z
 
 
-@QuickCompile
 def _evaluate_chunks(chunks: _Chunks, z):
     """Log-likelihoods of chunks `[chunk, point, dim]`."""
 
@@ -72,12 +69,7 @@ def _evaluate_chunks(chunks: _Chunks, z):
     return jax.vmap(one_chunk)(chunks, z)
 
 
-def _call(targets: StructureTarget, index, structure, z):
-    """One call of the compiled program, its result on the host."""
-    number = np.dtype(np.int32)
-    chunks = _gather(targets, on_device(index, number), on_device(structure, number))
-    found = _evaluate_chunks(chunks, on_device(z, targets.log_prior.dtype))
-    return jax.tree.map(np.asarray, found)
+_LIKELIHOODS = Program(_gather, _evaluate_chunks)
 
 
 def log_prior_density(
@@ -137,14 +129,12 @@ def evaluate_points(
     if first:
         source[first:], owner[first:] = source[0, 0], owner[0]
     parts = [slice(n, n + _CHUNKS_PER_CALL) for n in range(0, padded, _CHUNKS_PER_CALL)]
-    calls = call_each(
-        _call,
-        [
-            (targets, *divmod(owner[rows], num_structures), z[source[rows]])
-            for rows in parts
-        ],
-        targets,
-    )
+    dtype, number = targets.log_prior.dtype, np.int32
+    inputs = []
+    for rows in parts:
+        objects, kinds = divmod(owner[rows].astype(number), num_structures)
+        inputs.append((objects, kinds, z[source[rows]].astype(dtype)))
+    calls = run_each(_LIKELIHOODS, targets, inputs)
     flat = source[:total].reshape(-1)
 
     def gather(pick):

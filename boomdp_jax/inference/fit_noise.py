@@ -7,13 +7,11 @@ import jax
 import numpy as np
 
 from boomdp_jax.core.arrays import on_device
-from boomdp_jax.core.quick_compile import QuickCompile
-from boomdp_jax.core.side_by_side import call_each
+from boomdp_jax.core.spread import Program, run_each
 from boomdp_jax.inference.fit import Fits
 from boomdp_jax.inference.kalman import Filtered, NoiseLevel, extended_filter
 from boomdp_jax.inference.target import StructureTarget
 
-_INDEX = np.dtype(np.int32)
 # Points filtered by one call of the compiled program.
 _POINTS_PER_CALL = 8
 # Prior of the impulses: log-normal about this share of the prior scale of velocity and
@@ -33,20 +31,25 @@ class NoiseFit(NamedTuple):
     """`[object, body, 2]`."""
 
 
-@QuickCompile
-def _filter_points(targets: StructureTarget, index, structure, z, noise: NoiseLevel):
-    def one(i, k, z, noise):
-        target = jax.tree.map(lambda leaf: leaf[i], targets)
-        likelihood: Any = target.log_likelihood
-        coordinates = likelihood.coordinates
-        params = coordinates(z, target.structures[k])
-        return extended_filter(coordinates.scene, params, likelihood.data, noise)
-
-    return jax.vmap(one)(index, structure, z, noise)
+def _gather(targets: StructureTarget, index, structure, z, noise) -> tuple:
+    """What each point needs of the targets, so that their number is not compiled in."""
+    likelihood: Any = targets.log_likelihood
+    known = jax.tree.map(
+        lambda leaf: leaf[index], (likelihood.coordinates, likelihood.data)
+    )
+    return known, targets.structures[index, structure], z, noise
 
 
-def _filter_on_host(*arguments):
-    return jax.tree.map(np.asarray, _filter_points(*arguments))
+def _filter_points(known, active, z, noise) -> Filtered:
+    def one(known, active, z, noise):
+        coordinates, data = known
+        params = coordinates(z, active)
+        return extended_filter(coordinates.scene, params, data, NoiseLevel(*noise))
+
+    return jax.vmap(one)(known, active, z, noise)
+
+
+_FILTERS = Program(_gather, _filter_points)
 
 
 def filter_points(
@@ -73,19 +76,16 @@ def filter_points(
     inputs = []
     for begin in range(0, num, _POINTS_PER_CALL):
         rows = np.minimum(np.arange(begin, begin + _POINTS_PER_CALL), num - 1)
-        level = NoiseLevel(
-            on_device(noise.reading[rows], dtype), on_device(noise.impulse[rows], dtype)
-        )
+        level = (noise.reading[rows].astype(dtype), noise.impulse[rows].astype(dtype))
         inputs.append(
             (
-                targets,
-                on_device(index[rows], _INDEX),
-                on_device(structure[rows], _INDEX),
-                on_device(z[rows], dtype),
+                index[rows].astype(np.int32),
+                structure[rows].astype(np.int32),
+                z[rows].astype(dtype),
                 level,
             )
         )
-    calls = call_each(_filter_on_host, inputs, targets)
+    calls = run_each(_FILTERS, targets, inputs)
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:num], *calls)
 
 
