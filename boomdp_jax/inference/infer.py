@@ -161,7 +161,7 @@ def infer_batch(
             posteriors = _infer_structures(
                 key, specs, histories, settings, method=method, progress=progress
             )
-    seed = _seed_of(key)
+    seed = seed_of(key)
     return [dataclasses.replace(posterior, seed=seed) for posterior in posteriors]
 
 
@@ -209,8 +209,8 @@ def _infer_structures(
     ]
 
 
-def _seed_of(key: Key) -> int:
-    """The number that a key was made from, for the record."""
+def seed_of(key: Key) -> int:
+    """The number that a key was made from, for the record: its words as one."""
     words = np.asarray(jax.random.key_data(key)).ravel()
     return int.from_bytes(words.astype(">u4").tobytes(), "big")
 
