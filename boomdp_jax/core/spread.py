@@ -168,8 +168,8 @@ _over: ContextVar[_Over | None] = ContextVar("over", default=None)
 def _exchange(mine: list[Any]) -> list[list[Any]]:
     """The results of every process, of the same number and shapes in each."""
     leaves, treedef = jax.tree.flatten(mine)
-    arrays = [np.ascontiguousarray(leaf) for leaf in leaves]
-    packed = np.concatenate([array.reshape(-1).view(np.uint8) for array in arrays])
+    arrays = [np.asarray(leaf) for leaf in leaves]
+    packed = np.frombuffer(b"".join(array.tobytes() for array in arrays), np.uint8)
     # Few sizes, since each is a program.
     padded = np.zeros(1 << max(len(packed) - 1, 1).bit_length(), np.uint8)
     padded[: len(packed)] = packed
@@ -178,7 +178,7 @@ def _exchange(mine: list[Any]) -> list[list[Any]]:
     for row in np.asarray(multihost_utils.process_allgather(padded)):
         parts = np.split(row[: len(packed)], ends)
         theirs = [
-            np.ascontiguousarray(part).view(array.dtype).reshape(array.shape)
+            np.frombuffer(part.tobytes(), array.dtype).reshape(array.shape)
             for part, array in zip(parts, arrays, strict=True)
         ]
         everyone.append(jax.tree.unflatten(treedef, theirs))
