@@ -159,10 +159,9 @@ def begin_sweep(
     )
     sweep.folder.mkdir(exist_ok=True)
     path = sweep.folder / _MANIFEST
-    begun_with = json.loads(json.dumps(sweep.manifest()))
     if not path.exists():
-        write_json(path, begun_with)
-    check_same(path, read_json(path, SCHEMA), begun_with)
+        write_json(path, sweep.manifest())
+    sweep.check_folder()
     return sweep
 
 
@@ -240,6 +239,16 @@ class Sweep:
                     "another folder"
                 )
         return True
+
+    def check_folder(self) -> None:
+        """Make sure that the folder was begun with this sweep, as this process runs it.
+
+        Raises:
+            ValueError: it was not; the line names the first setting that differs.
+        """
+        path = self.folder / _MANIFEST
+        now = json.loads(json.dumps(self.manifest()))
+        check_same(path, read_json(path, SCHEMA), now)
 
     def check_untouched(self, units: Sequence[int]) -> None:
         """Make sure that none of these units is done.
