@@ -21,8 +21,8 @@ from boomdp_jax.inference.sweep import Sweep
 def sweep_with_ray(
     sweep: Sweep,
     *,
-    num_cpus: float = 1,
-    num_gpus: float = 0,
+    num_cpus: int | float = 1,
+    num_gpus: int | float = 0,
     max_retries: int = 3,
     on_done: Callable[[int], object] = lambda unit: None,
 ) -> list[Path]:
