@@ -40,12 +40,14 @@ class Objects(NamedTuple):
 
 
 def main() -> None:
-    parser = parser_of(__doc__, quick="batches of 1 and 2, short recordings")
+    parser = parser_of(__doc__, quick="batches of 1 and 2, short, by laplace")
     parser.add_argument("--batches", nargs="+", type=int, default=BATCHES)
     parser.add_argument("--runs", type=int, default=3, help="that count, of each")
     parser.add_argument("--method", default="rj")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
+    if arguments.quick:
+        arguments.method = "laplace"
     reporter = Reporter(arguments.out)
     batches = (1, 2) if arguments.quick else arguments.batches
     num_runs = 1 if arguments.quick else arguments.runs

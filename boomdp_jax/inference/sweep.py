@@ -167,7 +167,7 @@ def begin_sweep(
 
 @dataclasses.dataclass(frozen=True)
 class Sweep:
-    """A sweep whose folder is there; made by `begin_sweep`. It can be pickled."""
+    """A sweep whose folder is there; made by `begin_sweep`."""
 
     folder: Path
     specs: tuple[SceneSpec, ...]

@@ -9,13 +9,15 @@ import dataclasses
 import importlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from boomdp_jax.core.arrays import on_device
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.sweep import Sweep
+from boomdp_jax.physics.scene_spec import scene_spec_from_dict
 
 
 def sweep_with_ray(
@@ -59,8 +61,8 @@ def sweep_with_ray(
         ray.init()
     options = {"num_cpus": num_cpus, "num_gpus": num_gpus, "max_retries": max_retries}
     task = ray.remote(**options)(_run_unit)
-    is_double = jax.dtypes.canonicalize_dtype(float) == np.float64
-    shared = ray.put(_with_whole_names(sweep))
+    is_double = bool(jax.dtypes.canonicalize_dtype(float) == np.float64)
+    shared = ray.put(_pack(sweep))
     waiting = {}
     for unit in sweep.units():
         if sweep.is_done(unit):
@@ -75,20 +77,56 @@ def sweep_with_ray(
     return [path for unit in sweep.units() for path in sweep.paths(unit)]
 
 
-def _with_whole_names(sweep: Sweep) -> Sweep:
-    """The sweep with file names that hold in every working directory."""
+class _Parcel(NamedTuple):
+    """A sweep without arrays of JAX, which lose their float type on the way."""
+
+    bare: Sweep
+    """Without scenes and recordings."""
+    scenes: list[tuple[dict, str]]
+    """Contents and sources of the different ones."""
+    places: list[int]
+    """Which of them belongs to each recording."""
+    recordings: list[Path | dict[str, np.ndarray]]
+
+
+def _pack(sweep: Sweep) -> _Parcel:
+    """Files get names that hold in every working directory."""
+    different = {id(spec): spec for spec in sweep.specs}
+    order = list(different)
+    recordings: list[Path | dict[str, np.ndarray]] = []
+    for source in sweep.histories:
+        if isinstance(source, History):
+            names = [field.name for field in dataclasses.fields(source)]
+            recordings.append({n: np.asarray(getattr(source, n)) for n in names})
+        else:
+            recordings.append(Path(source).absolute())
+    return _Parcel(
+        bare=dataclasses.replace(
+            sweep, folder=sweep.folder.absolute(), specs=(), histories=()
+        ),
+        scenes=[(spec.to_dict(), spec.source) for spec in different.values()],
+        places=[order.index(id(spec)) for spec in sweep.specs],
+        recordings=recordings,
+    )
+
+
+def _unpack(parcel: _Parcel) -> Sweep:
+    specs = [scene_spec_from_dict(*scene) for scene in parcel.scenes]
     return dataclasses.replace(
-        sweep,
-        folder=sweep.folder.absolute(),
+        parcel.bare,
+        specs=tuple(specs[place] for place in parcel.places),
         histories=tuple(
-            source if isinstance(source, History) else Path(source).absolute()
-            for source in sweep.histories
+            source
+            if isinstance(source, Path)
+            else History(**{k: on_device(v, v.dtype) for k, v in source.items()})
+            for source in parcel.recordings
         ),
     )
 
 
-def _run_unit(sweep: Sweep, unit: int, is_double: bool) -> None:
+def _run_unit(parcel: _Parcel, unit: int, is_double: bool) -> None:
     """What a worker does: with the float type of whom it works for."""
     with jax.enable_x64(is_double):
+        sweep = _unpack(parcel)
         sweep.check_folder()
         sweep.run(unit)

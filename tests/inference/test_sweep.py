@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import json
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -226,13 +225,6 @@ def test_a_file_that_is_no_manifest_is_refused(tmp_path: Path):
     (tmp_path / "sweep.json").write_text('{"schema": "other"}')
     with pytest.raises(ValueError, match=r"sweep.json: schema: expected 'boomdp-sw"):
         read_json(tmp_path / "sweep.json", sweeps.SCHEMA)
-
-
-def test_a_sweep_travels_to_other_processes(tmp_path: Path, cheap: list):
-    run_all(begin(tmp_path / "here"), range(3))
-    sweep = pickle.loads(pickle.dumps(begin(tmp_path / "there")))
-    run_all(sweep, range(3))
-    assert_same_arrays(tmp_path / "here", tmp_path / "there", 7)
 
 
 def test_lengths_are_few_and_at_most_half_as_long_again():

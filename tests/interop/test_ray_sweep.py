@@ -21,6 +21,8 @@ KEY = 11
 class LocalRay(types.ModuleType):
     """The calls of Ray that are used: what is sent is pickled, the last is done first.
 
+    What is sent is unpickled in single precision, as in a fresh worker.
+
     A task is run when it is waited for, in the order of a stack, so that results come
     in another order than they were asked for in.
     """
