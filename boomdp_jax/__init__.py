@@ -25,6 +25,7 @@ _LAZY = {
     "Posterior": "boomdp_jax.inference",
     "infer": "boomdp_jax.inference",
     "infer_batch": "boomdp_jax.inference",
+    "infer_sweep": "boomdp_jax.inference",
     "load_posterior": "boomdp_jax.inference",
 }
 
@@ -38,6 +39,7 @@ __all__ = [
     "__version__",
     "infer",
     "infer_batch",
+    "infer_sweep",
     "load_history",
     "load_posterior",
     "load_scene",

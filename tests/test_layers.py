@@ -30,9 +30,9 @@ ALLOWED = {("cli", "experiments"), ("cli", "interop"), ("cli", "viz")}
 # A posterior's `plot` and `to_arviz` are doors to packages above, opened when called.
 ALLOWED_WHEN_CALLED = {("inference", "viz"), ("inference", "interop")}
 OWNERS = {"brax": "interop", "mujoco": "interop", "arviz": "interop"}
-OWNERS |= {"matplotlib": "viz"}
+OWNERS |= {"matplotlib": "viz", "ray": "interop"}
 # What `import boomdp_jax` must not load.
-HEAVY = ["brax", "mujoco", "arviz", "matplotlib", "numpyro"]
+HEAVY = ["brax", "mujoco", "arviz", "matplotlib", "numpyro", "ray"]
 
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

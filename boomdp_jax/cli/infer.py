@@ -14,7 +14,7 @@ from boomdp_jax.cli.output import (
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Infer from each data file, all in one compiled call, and report.
+    """Infer from each data file and report: in one compiled call, or as a sweep.
 
     Args:
         arguments: what `cli.main` parsed.
@@ -24,10 +24,15 @@ def run(arguments: argparse.Namespace) -> None:
     """
     from boomdp_jax.physics.scene_file import load_scene
 
-    check_writable(arguments.out)
+    is_sweep = _is_sweep(arguments)
+    if not is_sweep:
+        check_writable(arguments.out)
     check_figure(arguments.plot)
     spec = load_scene(arguments.scene)
     print_notes(spec.notes)
+    if is_sweep:
+        _sweep(arguments, spec)
+        return
     histories = _load_histories(arguments, spec)
     posteriors = _infer(arguments, spec, histories)
     for index, posterior in enumerate(posteriors):
@@ -37,23 +42,84 @@ def run(arguments: argparse.Namespace) -> None:
             if arguments.plot:
                 posterior.plot(numbered(arguments.plot, index, len(posteriors)))
     for path, posterior in zip(arguments.data, posteriors, strict=True):
-        if arguments.json:
-            print_json(posterior.to_json())
-        else:
-            print(f"{path}\n{posterior.summary()}", flush=True)
+        _print(arguments, path, posterior)
+
+
+def _print(arguments: argparse.Namespace, path: str, posterior) -> None:
+    """Report one posterior on standard output."""
+    if arguments.json:
+        print_json(posterior.to_json())
+    else:
+        print(f"{path}\n{posterior.summary()}", flush=True)
+
+
+def _is_sweep(arguments: argparse.Namespace) -> bool:
+    """Whether a sweep is asked for.
+
+    Raises:
+        ValueError: it is, and there is no folder to write to.
+    """
+    is_folder = arguments.out is not None and arguments.out.endswith("/")
+    for name in ("batch", "shard", "resume"):
+        if getattr(arguments, name) and not is_folder:
+            raise ValueError(
+                f"--{name}: expected --out with a folder that ends in /, got "
+                f"{arguments.out}"
+            )
+    return is_folder
+
+
+def _sweep(arguments: argparse.Namespace, spec) -> None:
+    """Infer unit after unit, each written and reported as it is done."""
+    import jax
+
+    from boomdp_jax.inference.posterior import load_posterior
+    from boomdp_jax.inference.sweep import begin_sweep
+
+    shard, batch = arguments.shard or (0, 1), arguments.batch or 16
+    num_units = -(-len(arguments.data) // batch)
+    for unit in range(shard[0], num_units, shard[1]):
+        # Bad input is found before the work begins.
+        for path in arguments.data[unit * batch : (unit + 1) * batch]:
+            _load_table(arguments, spec, path)
+    sweep = begin_sweep(
+        jax.random.key(arguments.seed),
+        spec,
+        arguments.data,
+        arguments.out,
+        batch=batch,
+        num_rows=arguments.rows,
+        method=arguments.method,
+    )
+    units = sweep.units(shard)
+    if not arguments.resume:
+        sweep.check_untouched(units)
+    for place, unit in enumerate(units):
+        print(f"unit {unit}, {place + 1} of {len(units)}", file=sys.stderr)
+        with contextlib.redirect_stdout(sys.stderr):
+            sweep.run(unit, progress=True)
+        for index, path in zip(sweep.objects(unit), sweep.paths(unit), strict=True):
+            posterior = load_posterior(path)
+            if arguments.plot:
+                with contextlib.redirect_stdout(sys.stderr):
+                    num_files = len(arguments.data)
+                    posterior.plot(numbered(arguments.plot, index, num_files))
+            _print(arguments, arguments.data[index], posterior)
+
+
+def _load_table(arguments: argparse.Namespace, spec, path: str):
+    """A recording that is not empty."""
+    from boomdp_jax.core.history_file import load_transitions
+
+    table = load_transitions(path, spec=spec, num_rows=arguments.rows)
+    if not table.num_rows:
+        raise ValueError(f"{table.source}: expected at least one row, got none")
+    return table
 
 
 def _load_histories(arguments: argparse.Namespace, spec) -> list:
     """Histories of equal capacity, so that they share one compiled call."""
-    from boomdp_jax.core.history_file import load_transitions
-
-    tables = [
-        load_transitions(path, spec=spec, num_rows=arguments.rows)
-        for path in arguments.data
-    ]
-    for table in tables:
-        if not table.num_rows:
-            raise ValueError(f"{table.source}: expected at least one row, got none")
+    tables = [_load_table(arguments, spec, path) for path in arguments.data]
     capacity = max(table.num_rows for table in tables)
     return [table.to_history(capacity=capacity) for table in tables]
 

@@ -70,8 +70,26 @@ def _add_infer(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=_whole(0, 2**32 - 1), default=0)
     add(
         "--out",
-        metavar="POST.npz",
-        help="write the posterior; of several data files, to POST-0.npz, POST-1.npz...",
+        metavar="POST.npz|DIR/",
+        help="write the posterior; of several data files, to POST-0.npz, POST-1.npz...;"
+        " with a slash: a sweep, each unit written to the folder as it is done",
+    )
+    add(
+        "--batch",
+        type=_whole(1),
+        metavar="N",
+        help="of a sweep: data files in a unit, inferred in one call; default: 16",
+    )
+    add(
+        "--shard",
+        type=_shard,
+        metavar="I/N",
+        help="of a sweep: do units I, I + N, I + 2 N... only; I from 0",
+    )
+    add(
+        "--resume",
+        action="store_true",
+        help="of a sweep: go on where the folder stands, to the same bits",
     )
     add("--json", action="store_true", help="one JSON object a data file, a line each")
     add("--plot", metavar="FIG.png", help="draw the posterior; numbered like --out")
@@ -135,6 +153,15 @@ def _whole(least: int, most: int | None = None) -> Callable[[str], int]:
         return number
 
     return read
+
+
+def _shard(text: str) -> tuple[int, int]:
+    place, _, num = text.partition("/")
+    if place.isdecimal() and num.isdecimal() and int(place) < int(num):
+        return int(place), int(num)
+    raise argparse.ArgumentTypeError(
+        f"expected I/N, whole numbers with 0 <= I < N, got {text!r}"
+    )
 
 
 def _scale(text: str) -> float:

@@ -108,7 +108,7 @@ def is_applied_once() -> bool:
     with (
         jax.ensure_compile_time_eval(),
         jax.disable_jit(False),
-        jax.default_device(jax.devices("cpu")[0]),
+        jax.default_device(jax.local_devices(backend="cpu")[0]),
     ):
         found = jax.jit(reduce)(first, second, np.float32(5.0))
         return all(np.array_equal(f, e) for f, e in zip(found, expected, strict=True))

@@ -23,6 +23,9 @@ from boomdp_jax.inference.posterior import Posterior as Posterior
 from boomdp_jax.inference.posterior import load_posterior as load_posterior
 from boomdp_jax.inference.predict import predict as predict
 from boomdp_jax.inference.structure_kernel import StructureKernel as StructureKernel
+from boomdp_jax.inference.sweep import Sweep as Sweep
+from boomdp_jax.inference.sweep import begin_sweep as begin_sweep
+from boomdp_jax.inference.sweep import infer_sweep as infer_sweep
 from boomdp_jax.inference.target import StructureTarget as StructureTarget
 
 __all__ = [
@@ -36,9 +39,12 @@ __all__ = [
     "Posterior",
     "StructureKernel",
     "StructureTarget",
+    "Sweep",
+    "begin_sweep",
     "infer",
     "infer_batch",
     "infer_kinds",
+    "infer_sweep",
     "informative_wrench",
     "load_kinds",
     "load_posterior",

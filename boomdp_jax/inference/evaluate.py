@@ -13,9 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from boomdp_jax.core.arrays import on_device
-from boomdp_jax.core.quick_compile import QuickCompile
-from boomdp_jax.core.side_by_side import call_each
+from boomdp_jax.core.spread import Program, run_each
 from boomdp_jax.inference.chunking import Chunking
 from boomdp_jax.inference.filtered_likelihood import without_gains
 from boomdp_jax.inference.target import StructureTarget
@@ -44,17 +42,16 @@ class _Chunks(NamedTuple):
     active: Bool[Array, "chunk slot"]
 
 
-@QuickCompile
-def _gather(targets: StructureTarget, index, structure) -> _Chunks:
+def _gather(targets: StructureTarget, index, structure, z) -> tuple[_Chunks, Any]:
+    """What chunks need of the targets, which alone knows how many objects there are."""
     likelihood: Any = targets.log_likelihood
     gains = jax.tree.map(lambda leaf: leaf[index, structure], likelihood.gains)
     reference = likelihood.reference[index, structure]
-    bare = without_gains(likelihood)
-    bare = jax.tree.map(lambda leaf: leaf[index], bare)
-    return _Chunks(bare, gains, reference, targets.structures[index, structure])
+    bare = jax.tree.map(lambda leaf: leaf[index], without_gains(likelihood))
+    active = targets.structures[index, structure]
+    return _Chunks(bare, gains, reference, active), z
 
 
-@QuickCompile
 def _evaluate_chunks(chunks: _Chunks, z):
     """Log-likelihoods of chunks `[chunk, point, dim]`."""
 
@@ -72,12 +69,7 @@ def _evaluate_chunks(chunks: _Chunks, z):
     return jax.vmap(one_chunk)(chunks, z)
 
 
-def _call(targets: StructureTarget, index, structure, z):
-    """One call of the compiled program, its result on the host."""
-    number = np.dtype(np.int32)
-    chunks = _gather(targets, on_device(index, number), on_device(structure, number))
-    found = _evaluate_chunks(chunks, on_device(z, targets.log_prior.dtype))
-    return jax.tree.map(np.asarray, found)
+_LIKELIHOODS = Program(_gather, _evaluate_chunks)
 
 
 def log_prior_density(
@@ -115,11 +107,12 @@ def evaluate_points(
         One row per point, in the order given.
     """
     chunks = Chunking.of(index, structure, targets.structures.shape[1])
-    calls = call_each(
-        _call,
-        [(targets, *owner, z[rows]) for owner, rows in chunks.calls()],
-        targets,
-    )
+    dtype, number = targets.log_prior.dtype, np.int32
+    inputs = [
+        (objects.astype(number), structures.astype(number), z[rows].astype(dtype))
+        for (objects, structures), rows in chunks.calls()
+    ]
+    calls = run_each(_LIKELIHOODS, targets, inputs)
 
     def gather(pick):
         return chunks.in_order([pick(call) for call in calls])

@@ -1,13 +1,17 @@
 """From scenes and histories to posteriors: the one call that most users need."""
 
+import dataclasses
 import time
 from collections.abc import Sequence
 
 import jax
+import numpy as np
+from jax.sharding import Mesh
 
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.core.compile_time import CompileClock
 from boomdp_jax.core.history import History
+from boomdp_jax.core.spread import spread_over
 from boomdp_jax.inference.assemble import assemble_posterior
 from boomdp_jax.inference.block import Block, make_block, stack_blocks
 from boomdp_jax.inference.compile_ahead import signature
@@ -36,6 +40,7 @@ def infer(
     num_warmup: int = 200,
     num_samples: int = 500,
     progress: bool = False,
+    mesh: Mesh | None = None,
 ) -> Posterior:
     """Posterior over densities, joints, wheels, friction, noise, and which exist.
 
@@ -56,6 +61,9 @@ def infer(
         num_samples: iterations of each that are kept. `enumerate` and `laplace` give
             as many draws, `smc` has as many particles.
         progress: show stages on standard error.
+        mesh: devices to spread the work over, of one axis of type Auto; the result does
+            not depend on their number. After `jax.distributed.initialize` it may be
+            one of all hosts: each makes the same call and gets the whole result.
 
     Returns:
         Draws of all chains, with diagnostics: not ok, with reasons, also where two
@@ -63,7 +71,8 @@ def infer(
 
     Raises:
         ValueError: an unknown method, a history of another number of bodies, a scene
-            with more structures than can be told apart, a prior that makes no sense.
+            with more structures than can be told apart, a prior that makes no sense, a
+            mesh of several axes.
     """
     return infer_batch(
         key,
@@ -75,6 +84,7 @@ def infer(
         num_warmup=num_warmup,
         num_samples=num_samples,
         progress=progress,
+        mesh=mesh,
     )[0]
 
 
@@ -89,6 +99,7 @@ def infer_batch(
     num_warmup: int = 200,
     num_samples: int = 500,
     progress: bool = False,
+    mesh: Mesh | None = None,
 ) -> list[Posterior]:
     """The same for many scenes; equal blocks of bodies share one compiled call.
 
@@ -105,6 +116,7 @@ def infer_batch(
         num_warmup: as in `infer`.
         num_samples: as in `infer`.
         progress: show stages on standard error.
+        mesh: as in `infer`.
 
     Returns:
         One posterior per scene.
@@ -122,26 +134,47 @@ def infer_batch(
         )
     for spec, history in zip(specs, histories, strict=True):
         _check(spec, history)
-    if method in ("nuts", "svi"):
-        counts = {"num_samples": num_samples, "num_chains": num_chains}
-        if method == "nuts":
-            counts["num_warmup"] = num_warmup
-        run = {"nuts": run_nuts, "svi": run_svi}[method]
-        return [
-            run(
-                jax.random.fold_in(key, index),
-                spec,
-                history,
-                structure=structure,
-                progress_bar=progress,
-                **counts,
-            )
-            for index, (spec, history) in enumerate(zip(specs, histories, strict=True))
-        ]
-    if structure is not None:
+    if method not in ("nuts", "svi") and structure is not None:
         raise ValueError(f"structure: expected none with method {method!r}")
-    method = "rj" if method == "auto" else method
-    settings = SampleSettings(num_chains, num_warmup, num_samples)
+    with spread_over(mesh):
+        if method in ("nuts", "svi"):
+            counts = {"num_samples": num_samples, "num_chains": num_chains}
+            if method == "nuts":
+                counts["num_warmup"] = num_warmup
+            run = {"nuts": run_nuts, "svi": run_svi}[method]
+            posteriors = [
+                run(
+                    jax.random.fold_in(key, index),
+                    spec,
+                    history,
+                    structure=structure,
+                    progress_bar=progress,
+                    **counts,
+                )
+                for index, (spec, history) in enumerate(
+                    zip(specs, histories, strict=True)
+                )
+            ]
+        else:
+            method = "rj" if method == "auto" else method
+            settings = SampleSettings(num_chains, num_warmup, num_samples)
+            posteriors = _infer_structures(
+                key, specs, histories, settings, method=method, progress=progress
+            )
+    seed = seed_of(key)
+    return [dataclasses.replace(posterior, seed=seed) for posterior in posteriors]
+
+
+def _infer_structures(
+    key: Key,
+    specs: Sequence[SceneSpec],
+    histories: Sequence[History],
+    settings: SampleSettings,
+    *,
+    method: str,
+    progress: bool,
+) -> list[Posterior]:
+    """Posteriors over structures, equal blocks of all scenes together."""
     start = time.perf_counter()
     histories = padded_histories(histories)
     problems, notes = [], []
@@ -174,6 +207,12 @@ def infer_batch(
         )
         for index, spec in enumerate(specs)
     ]
+
+
+def seed_of(key: Key) -> int:
+    """The number that a key was made from, for the record: its words as one."""
+    words = np.asarray(jax.random.key_data(key)).ravel()
+    return int.from_bytes(words.astype(">u4").tobytes(), "big")
 
 
 def _check(spec: SceneSpec, history: History) -> None:

@@ -6,10 +6,11 @@ NumPyro's default mass matrix, the identity, every path then takes hundreds of s
 and its regularised estimate stays too wide; here the Laplace approximation gives the
 first one, and the draws of all chains together the second: ten to thirty steps a path.
 
-Chains run one after the other in one compiled loop. Measured on a pinned box, 100 rows,
+Every chain is a call of one compiled program for each fifty iterations, and chains go
+side by side on threads or devices (`core.spread`). Measured on a pinned box, 100 rows,
 4 chains of 500 iterations on a busy core: NumPyro's vectorised chains compile for 30 s
-and run for 13 s, since every chain waits for the longest path; this takes 18 s to
-compile, once for all blocks of a layout, and runs for one second.
+and run for 13 s, since every chain waits for the longest path; chains by themselves
+take 18 s to compile, once for all blocks of a layout, and run for one second.
 
 Prefer it to reversible jumps where the structure is known and the posterior far from
 normal; it says nothing about which constraints exist.
@@ -29,6 +30,7 @@ from numpyro.infer.hmc import hmc
 from numpyro.infer.util import potential_energy
 
 from boomdp_jax.core.arrays import Key
+from boomdp_jax.core.spread import Program, run_each
 from boomdp_jax.inference.block import stack_blocks
 from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics
 from boomdp_jax.inference.find_modes import find_single_step_modes
@@ -91,19 +93,21 @@ def sample_model(
     start = fitted_start(fit_key, start_key, model, num_chains)
     half = max(num_warmup // 2, 1)
     report("warming up")
+    chains = _Chains(model, half)
     keys = [jax.random.split(run_key, num_chains) for run_key in run_keys]
-    states = _begin(model, keys[0], start, half)
-    states, warm = _iterate(model, states, start.covariance, half, half)
+    states = chains.begin(keys[0], start)
+    states, warm = chains.iterate(states, start.covariance, half)
     flat = _flatten(model, warm.z)[:, half // 2 :]
     within = flat - jnp.mean(flat, axis=1, keepdims=True)
     scatter = jnp.einsum("cdi,cdj->ij", within, within)
     num = flat.shape[0] * flat.shape[1]
     covariance = scatter + _LAPLACE_DRAWS * start.covariance
     covariance = covariance / (num + _LAPLACE_DRAWS)
-    states = _begin(model, keys[1], Start(states.z, covariance), half)
-    states, _ = _iterate(model, states, covariance, half, half)
+    points = _stack([state.z for state in states])
+    states = chains.begin(keys[1], Start(jax.device_put(points), covariance))
+    states, _ = chains.iterate(states, covariance, half)
     report("sampling")
-    _, drawn = _iterate(model, states, covariance, half, num_samples)
+    _, drawn = chains.iterate(states, covariance, num_samples)
     return _collect(model, drawn)
 
 
@@ -144,27 +148,74 @@ def _hmc(model: ObjectModel, start: Start, num_warmup: int, key: Key) -> tuple:
     return state, sample
 
 
-@eqx.filter_jit
-def _begin(model: ObjectModel, keys: Array, start: Start, num_warmup: int) -> Any:
-    """States of all chains; the start's points have a leading chain axis."""
+class _Static(NamedTuple):
+    """What a model is besides its arrays, hashable, and the length of the warm-up."""
 
-    def one(inputs: tuple) -> Any:
-        key, point = inputs
-        return _hmc(model, Start(point, start.covariance), num_warmup, key)[0]
+    treedef: Any
+    leaves: tuple
+    num_warmup: int
 
-    return jax.lax.map(one, (keys, start.point))
+    def model(self, arrays: Any) -> ObjectModel:
+        """The whole model."""
+        static = jax.tree.unflatten(self.treedef, self.leaves)
+        return eqx.combine(arrays, static, is_leaf=lambda leaf: leaf is None)
 
 
-@eqx.filter_jit
-def _advance(
-    model: ObjectModel, states: Any, covariance: Array, num_warmup: int
-) -> tuple[Any, _Drawn]:
-    """Some iterations of every chain, one chain after the other."""
+class _Chains:
+    """All chains of a model, each a call of the same program for so many iterations."""
 
-    def chain(state: Any) -> tuple[Any, _Drawn]:
+    def __init__(self, model: ObjectModel, num_warmup: int):
+        self._arrays, static = eqx.partition(model, eqx.is_array)
+        leaves, treedef = jax.tree.flatten(static, is_leaf=lambda leaf: leaf is None)
+        self._begin, self._advance = _programs(
+            _Static(treedef, tuple(leaves), num_warmup)
+        )
+
+    def begin(self, keys: Array, start: Start) -> list[Any]:
+        """States of all chains; the start's points have a leading chain axis."""
+        # Words of keys are plain arrays, which go to any device.
+        words = np.asarray(jax.random.key_data(keys))
+        points = jax.tree.map(np.asarray, start.point)
+        inputs = [
+            (words[chain], jax.tree.map(lambda leaf, chain=chain: leaf[chain], points))
+            for chain in range(len(words))
+        ]
+        return run_each(self._begin, (self._arrays, start.covariance), inputs)
+
+    def iterate(
+        self, states: list[Any], covariance: Array, num: int
+    ) -> tuple[list[Any], _Drawn]:
+        """At least `num` iterations; the last `num` of them are returned."""
+        parts = []
+        shared = (self._arrays, covariance)
+        for _ in range(-(-num // _CHUNK)):
+            found = run_each(self._advance, shared, [(state,) for state in states])
+            states = [state for state, _ in found]
+            parts.append(_stack([drawn for _, drawn in found]))
+        drawn = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *parts)
+        return states, jax.tree.map(lambda leaf: jax.device_put(leaf[:, -num:]), drawn)
+
+
+def _stack(trees: list[Any]) -> Any:
+    """Trees of arrays as one with a leading axis."""
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
+
+
+@functools.lru_cache(maxsize=16)
+def _programs(static: _Static) -> tuple[Program, Program]:
+    """What begins a chain, and what takes it some iterations further."""
+
+    def begin(shared: tuple, words: Array, point: dict[str, Array]) -> Any:
+        arrays, covariance = shared
+        start = Start(point, covariance)
+        return _hmc(static.model(arrays), start, static.num_warmup, words)[0]
+
+    def advance(shared: tuple, state: Any) -> tuple[Any, _Drawn]:
+        arrays, covariance = shared
         # NumPyro's iteration is set up by making a start; the compiler drops it.
         start = Start(state.z, covariance)
-        _, sample = _hmc(model, start, num_warmup, state.rng_key)
+        model = static.model(arrays)
+        _, sample = _hmc(model, start, static.num_warmup, state.rng_key)
 
         def iterate(state: Any, _: None) -> tuple[Any, _Drawn]:
             state = sample(state)
@@ -174,19 +225,7 @@ def _advance(
 
         return jax.lax.scan(iterate, state, None, length=_CHUNK)
 
-    return jax.lax.map(chain, states)
-
-
-def _iterate(
-    model: ObjectModel, states: Any, covariance: Array, num_warmup: int, num: int
-) -> tuple[Any, _Drawn]:
-    """At least `num` iterations; the last `num` of them are returned."""
-    parts = []
-    for _ in range(-(-num // _CHUNK)):
-        states, drawn = _advance(model, states, covariance, num_warmup)
-        parts.append(drawn)
-    drawn = jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=1), *parts)
-    return states, jax.tree.map(lambda leaf: leaf[:, -num:], drawn)
+    return Program(begin), Program(advance)
 
 
 def fitted_start(

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from boomdp_jax.core.arrays import Key, on_device
+from boomdp_jax.core.spread import is_spread
 from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics, diagnose_chains
 from boomdp_jax.inference.compile_ahead import CompileAhead, signature
 from boomdp_jax.inference.enumerate_structures import enumerate_structures
@@ -89,9 +90,10 @@ def sample_blocks(
     """
     fit_key, draw_key, noise_key = jax.random.split(key, 3)
     draw = SAMPLERS[method]
+    with_filters = not is_spread()
     ahead = CompileAhead(
-        lambda: _rehearse(draw_key, targets, settings, draw),
-        (signature(targets), settings, method),
+        lambda: _rehearse(draw_key, targets, settings, draw, with_filters),
+        (signature(targets), settings, method, with_filters),
     )
     with ahead:
         found: Found = find_modes(fit_key, targets, settings.fit, report)
@@ -229,16 +231,21 @@ def _rehearse(
     targets: StructureTarget,
     settings: SampleSettings,
     draw: Callable[..., StructureDraws],
+    with_filters: bool,
 ) -> None:
-    """Go through all stages but the likelihood of many points, to compile them."""
+    """Go through all stages but the likelihood of many points, to compile them.
+
+    Programs of a mesh are left out: they run in the same order in all its processes.
+    """
     num_objects, num_structures = targets.structures.shape[:2]
     likelihood: Any = targets.log_likelihood
     reading = np.asarray(likelihood.reference, float)[:1, 0]
     dim = targets.slot.shape[1]
     first = np.zeros(1, int)
     noise = NoiseFit(reading, reading[..., 2:])
-    for run in (filter_points, filter_densities):
-        run(targets, first, first, np.zeros((1, dim)), noise)
+    if with_filters:
+        for run in (filter_points, filter_densities):
+            run(targets, first, first, np.zeros((1, dim)), noise)
     num_modes = num_structures * settings.fit.num_modes
     dtype = targets.log_prior.dtype
     structure = np.repeat(np.arange(num_structures), settings.fit.num_modes)

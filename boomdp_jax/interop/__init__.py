@@ -9,6 +9,7 @@ from boomdp_jax.interop.object_families import random_pushes as random_pushes
 from boomdp_jax.interop.object_families import (
     record_random_pushes as record_random_pushes,
 )
+from boomdp_jax.interop.ray_sweep import sweep_with_ray as sweep_with_ray
 from boomdp_jax.interop.recording import READING_NOISE as READING_NOISE
 from boomdp_jax.interop.recording import record as record
 from boomdp_jax.interop.recording import with_reading_noise as with_reading_noise
@@ -22,6 +23,7 @@ __all__ = [
     "random_pushes",
     "record",
     "record_random_pushes",
+    "sweep_with_ray",
     "to_arviz",
     "with_reading_noise",
 ]

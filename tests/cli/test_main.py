@@ -61,6 +61,28 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ),
         ("infer data.npz --scene scene.json --out .", ".: expected a file"),
         ("infer data.npz --scene scene.json --plot fig.doc", "fig.doc: expected a fig"),
+        (
+            "infer data.npz --scene scene.json --shard 0/2",
+            "--shard: expected --out with a folder that ends in /",
+        ),
+        (
+            "infer data.npz --scene scene.json --batch 4 --out post.npz",
+            "--batch: expected --out with a folder that ends in /, got post.npz",
+        ),
+        (
+            "infer data.npz --scene scene.json --out out/ --shard 2/2",
+            "--shard: expected I/N, whole numbers with 0 <= I < N, got '2/2'",
+        ),
+        (
+            "infer data.npz --scene scene.json --out out/ --shard half",
+            "--shard: expected I/N",
+        ),
+        ("infer data.npz --scene scene.json --out out/ --batch 0", "--batch: expected"),
+        (
+            "infer data.npz empty.npz --scene scene.json --out out/",
+            "empty.npz: expected at least one row",
+        ),
+        ("infer data.npz --scene scene.json --out no/out/", "no/out: No such file"),
         ("predict post.npz", "required: DATA.npz"),
         ("predict post.npz data.npz --horizon 0", "--horizon: expected a whole"),
         ("simulate scene.json --out o.npz", "required: --actions"),

@@ -35,7 +35,7 @@ def test_prior_of_noise_is_normalised_and_is_what_is_drawn():
 @pytest.fixture(scope="module")
 def reference():
     """Draws of log-mass and six log-noises by NUTS, and the log-evidence."""
-    history = free_box(np.random.default_rng(11), 25, noise=3.0 * NOISE)
+    history = free_box(np.random.default_rng(11), 15, noise=3.0 * NOISE)
     joint = joint_normal(history)
     middle = np.log(0.1 * SCALE[2:])
 
@@ -51,8 +51,8 @@ def reference():
     kernel = NUTS(potential_fn=lambda x: -log_posterior(x), dense_mass=True)
     mcmc = MCMC(
         kernel,
-        num_warmup=500,
-        num_samples=1500,
+        num_warmup=300,
+        num_samples=1000,
         num_chains=4,
         chain_method="vectorized",
         progress_bar=False,

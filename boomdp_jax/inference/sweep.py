@@ -1,0 +1,354 @@
+"""Many inferences in units that are done one by one, anywhere, and resumed when killed.
+
+A unit is so many consecutive objects: one call of `infer_batch` with a key of its own.
+Which objects are in it does not depend on who does it or when, so neither do its bits.
+Shards of a sweep, on several machines or after a kill, write into the same folder:
+
+- `sweep.json`, what the folder was begun with; others are refused.
+- `object-000012.npz`, the posterior of each object, as `Posterior.save` writes it.
+- `unit-000003.json`, written when all files of a unit are there, with the hashes of
+  what went into them and of themselves: what does not match is done again.
+"""
+
+import dataclasses
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from boomdp_jax.core.arrays import Key, on_device
+from boomdp_jax.core.history import History
+from boomdp_jax.core.history_file import load_history
+from boomdp_jax.core.json_file import check_same, read_json, write_json
+from boomdp_jax.inference.fixed_structure import Structure
+from boomdp_jax.inference.infer import METHODS, infer_batch, seed_of
+from boomdp_jax.inference.posterior import library_versions
+from boomdp_jax.physics.scene_spec import SceneSpec
+
+SCHEMA = "boomdp-sweep-1"
+UNIT_SCHEMA = "boomdp-sweep-unit-1"
+
+_MANIFEST = "sweep.json"
+# Fewest rows that a history is padded to.
+_LEAST_ROWS = 4
+
+
+def infer_sweep(
+    key: Key,
+    specs: SceneSpec | Sequence[SceneSpec],
+    histories: Sequence[History | str | os.PathLike],
+    out_dir: str | os.PathLike,
+    *,
+    shard: tuple[int, int] = (0, 1),
+    batch: int = 16,
+    resume: bool = True,
+    num_rows: int | None = None,
+    progress: bool = False,
+    **options: Any,
+) -> list[Path]:
+    """Infer many objects, unit after unit, and write each posterior to a file.
+
+    What is there already is not done again. A run that was killed at any moment, and
+    shards of other processes, end in the same arrays as one run of everything.
+
+    Args:
+        key: random key; the key of a unit is folded in from its number.
+        specs: one scene for all, or one for each history.
+        histories: recordings, or files of the form `planar-transitions-1`, which are
+            read when their unit's turn comes.
+        out_dir: folder to write to; made if its parent is there.
+        shard: (i, n): do units i, i + n, i + 2 n and so on.
+        batch: objects of one unit, inferred in one compiled call.
+        resume: whether units of this shard may be there already.
+        num_rows: how many rows of each file to use, from the first; default: all.
+        progress: show stages on standard error.
+        **options: `method`, `structure`, `num_chains`, `num_warmup` and `num_samples`,
+            as `infer_batch` takes them.
+
+    Returns:
+        The files of this shard's objects, in order.
+
+    Raises:
+        ValueError: a folder that was begun with something else, a shard that does not
+            exist, or as in `infer_batch`.
+        OSError: a file cannot be read or written.
+    """
+    sweep = begin_sweep(
+        key, specs, histories, out_dir, batch=batch, num_rows=num_rows, **options
+    )
+    units = sweep.units(shard)
+    if not resume:
+        sweep.check_untouched(units)
+    for unit in units:
+        sweep.run(unit, progress=progress)
+    return [path for unit in units for path in sweep.paths(unit)]
+
+
+def begin_sweep(
+    key: Key,
+    specs: SceneSpec | Sequence[SceneSpec],
+    histories: Sequence[History | str | os.PathLike],
+    out_dir: str | os.PathLike,
+    *,
+    batch: int = 16,
+    num_rows: int | None = None,
+    method: str = "auto",
+    structure: Structure | None = None,
+    num_chains: int = 4,
+    num_warmup: int = 200,
+    num_samples: int = 500,
+) -> "Sweep":
+    """Make or reopen the folder of a sweep, whose units can then be run one by one.
+
+    Args:
+        key: as in `infer_sweep`, as are all others.
+        specs: one scene for all, or one for each history.
+        histories: recordings, or files.
+        out_dir: folder to write to.
+        batch: objects of one unit.
+        num_rows: how many rows of each file to use.
+        method: as in `infer_batch`.
+        structure: as in `infer_batch`.
+        num_chains: as in `infer_batch`.
+        num_warmup: as in `infer_batch`.
+        num_samples: as in `infer_batch`.
+
+    Returns:
+        The sweep; nothing of it has been run yet.
+
+    Raises:
+        ValueError: a folder that was begun with something else, or arguments that make
+            no sense.
+        OSError: the folder cannot be made.
+    """
+    if method not in METHODS:
+        raise ValueError(
+            f"method: expected one of {', '.join(METHODS)}; got {method!r}"
+        )
+    if batch < 1:
+        raise ValueError(f"batch: expected at least 1, got {batch}")
+    if not histories:
+        raise ValueError("histories: expected at least one, got none")
+    if isinstance(specs, SceneSpec):
+        specs = [specs] * len(histories)
+    if len(specs) != len(histories):
+        raise ValueError(
+            f"histories: expected one per scene, {len(specs)}, got {len(histories)}"
+        )
+    options = {
+        "method": method,
+        "structure": None if structure is None else dict(structure),
+        "num_chains": num_chains,
+        "num_warmup": num_warmup,
+        "num_samples": num_samples,
+    }
+    words = np.asarray(jax.random.key_data(key)).ravel()
+    sweep = Sweep(
+        folder=Path(out_dir),
+        specs=tuple(specs),
+        histories=tuple(histories),
+        words=tuple(int(word) for word in words),
+        batch=batch,
+        num_rows=num_rows,
+        options=options,
+    )
+    sweep.folder.mkdir(exist_ok=True)
+    path = sweep.folder / _MANIFEST
+    if not path.exists():
+        write_json(path, sweep.manifest())
+    sweep.check_folder()
+    return sweep
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweep:
+    """A sweep whose folder is there; made by `begin_sweep`."""
+
+    folder: Path
+    specs: tuple[SceneSpec, ...]
+    histories: tuple[History | str | os.PathLike, ...]
+    words: tuple[int, ...]
+    """Of the random key."""
+    batch: int
+    num_rows: int | None
+    options: dict[str, Any]
+    """Of `infer_batch`."""
+
+    @property
+    def num_units(self) -> int:
+        """How many units there are; the last one may be smaller."""
+        return -(-len(self.histories) // self.batch)
+
+    @property
+    def key(self) -> Key:
+        """The random key."""
+        words = on_device(self.words, np.dtype(np.uint32))
+        return jax.random.wrap_key_data(words)
+
+    def units(self, shard: tuple[int, int] = (0, 1)) -> range:
+        """Numbers of the units of a shard (i, n): i, i + n, i + 2 n and so on."""
+        place, num = shard
+        if not 0 <= place < num:
+            raise ValueError(f"shard: expected (i, n) with 0 <= i < n, got {shard}")
+        return range(place, self.num_units, num)
+
+    def objects(self, unit: int) -> range:
+        """Numbers of the objects of a unit."""
+        begin = unit * self.batch
+        return range(begin, min(begin + self.batch, len(self.histories)))
+
+    def paths(self, unit: int) -> list[Path]:
+        """Files of the posteriors of a unit."""
+        return [self.folder / f"object-{n:06d}.npz" for n in self.objects(unit)]
+
+    def is_done(self, unit: int) -> bool:
+        """Whether a unit's files are there, whole.
+
+        Raises:
+            ValueError: they are, and were made from other recordings or scenes.
+        """
+        path = self._record(unit)
+        if not path.exists():
+            return False
+        try:
+            record = read_json(path, UNIT_SCHEMA)
+        except ValueError:
+            return False
+        files, inputs = record.get("files"), record.get("inputs")
+        numbers = self.objects(unit)
+        if not isinstance(files, dict) or not isinstance(inputs, list):
+            return False
+        if len(inputs) != len(numbers):
+            return False
+        for file in self.paths(unit):
+            known = files.get(file.name)
+            if not file.exists() or known != _hash(file.read_bytes()):
+                return False
+        for number, known in zip(numbers, inputs, strict=True):
+            if known != self._input_hash(number):
+                source = self.histories[number]
+                name = "" if isinstance(source, History) else f" ({source})"
+                raise ValueError(
+                    f"{path}: inputs: object {number}{name}: expected the recording "
+                    "and scene that the folder was begun with, got others; choose "
+                    "another folder"
+                )
+        return True
+
+    def check_folder(self) -> None:
+        """Make sure that the folder was begun with this sweep, as this process runs it.
+
+        Raises:
+            ValueError: it was not; the line names the first setting that differs.
+        """
+        path = self.folder / _MANIFEST
+        now = json.loads(json.dumps(self.manifest()))
+        check_same(path, read_json(path, SCHEMA), now)
+
+    def check_untouched(self, units: Sequence[int]) -> None:
+        """Make sure that none of these units is done.
+
+        Raises:
+            ValueError: one is.
+        """
+        for unit in units:
+            if self._record(unit).exists():
+                raise ValueError(
+                    f"{self.folder}: expected no results of unit {unit} yet, got some; "
+                    "resume, or choose another folder"
+                )
+
+    def run(self, unit: int, *, progress: bool = False) -> bool:
+        """Do a unit, unless it is done.
+
+        Args:
+            unit: its number.
+            progress: show stages on standard error.
+
+        Returns:
+            Whether there was anything to do.
+        """
+        if self.is_done(unit):
+            return False
+        # Hashed before it is read: a recording that changes meanwhile is noticed.
+        inputs = [self._input_hash(number) for number in self.objects(unit)]
+        histories = [self._history(number) for number in self.objects(unit)]
+        capacity = roomy(max(history.capacity for history in histories))
+        longest = int(np.argmax([history.capacity for history in histories]))
+        histories[longest] = histories[longest].padded(capacity)
+        specs = [self.specs[number] for number in self.objects(unit)]
+        posteriors = infer_batch(
+            jax.random.fold_in(self.key, unit),
+            specs,
+            histories,
+            progress=progress,
+            **self.options,
+        )
+        files = {}
+        for path, posterior in zip(self.paths(unit), posteriors, strict=True):
+            # Left by a run that was killed as it wrote.
+            for partial in self.folder.glob(f".{path.name}.*.part"):
+                partial.unlink(missing_ok=True)
+            dataclasses.replace(posterior, seed=seed_of(self.key)).save(path)
+            files[path.name] = _hash(path.read_bytes())
+        write_json(
+            self._record(unit),
+            {"schema": UNIT_SCHEMA, "unit": unit, "inputs": inputs, "files": files},
+        )
+        return True
+
+    def manifest(self) -> dict:
+        """All that the bits of the results depend on, but for the recordings."""
+        return {
+            "schema": SCHEMA,
+            "seed": seed_of(self.key),
+            "num_objects": len(self.histories),
+            "batch": self.batch,
+            "num_rows": self.num_rows,
+            **self.options,
+            "float": str(jax.dtypes.canonicalize_dtype(float)),
+            "platform": jax.default_backend(),
+            "versions": library_versions(),
+        }
+
+    def _record(self, unit: int) -> Path:
+        return self.folder / f"unit-{unit:06d}.json"
+
+    def _history(self, number: int) -> History:
+        source = self.histories[number]
+        if isinstance(source, History):
+            return source
+        spec = self.specs[number]
+        return load_history(source, spec=spec, num_rows=self.num_rows)
+
+    def _input_hash(self, number: int) -> str:
+        """Of a recording and its scene."""
+        source = self.histories[number]
+        scene = json.dumps(self.specs[number].to_dict(), sort_keys=True).encode()
+        if not isinstance(source, History):
+            return _hash(scene, Path(source).read_bytes())
+        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(source)]
+        parts = [(f"{x.dtype}{x.shape}".encode(), x.tobytes()) for x in leaves]
+        return _hash(scene, *(part for pair in parts for part in pair))
+
+
+def roomy(num_rows: int) -> int:
+    """The next of 4, 6, 8, 12, 16, 24...: few lengths, so that few are compiled for."""
+    power = _LEAST_ROWS
+    while 2 * power <= num_rows:
+        power *= 2
+    return next(n for n in (power, power * 3 // 2, 2 * power) if n >= num_rows)
+
+
+def _hash(*parts: bytes) -> str:
+    """Of several strings of bytes, one after the other, each with its length."""
+    found = hashlib.sha256()
+    for part in parts:
+        found.update(len(part).to_bytes(8, "big"))
+        found.update(part)
+    return found.hexdigest()
