@@ -1,4 +1,10 @@
-"""Proposals of noise fitted to each structure: a t about the most probable noise."""
+"""Proposals of noise fitted to each structure: a mixture about its peaks.
+
+What a reading scatters by, noise of readings or of the motion may explain, and often
+each of them could: the peak with the one is not the only one. Fits therefore start
+anew where what a peak says is noise of velocity or spin readings is noise of the
+motion, and each peak is covered by a narrow component and by a wide one.
+"""
 
 import math
 from typing import NamedTuple
@@ -6,25 +12,34 @@ from typing import NamedTuple
 import numpy as np
 
 from boomdp_jax.inference.fit import Fits
-from boomdp_jax.inference.fit_noise import fit_noise
-from boomdp_jax.inference.noise_level import NoiseFit
+from boomdp_jax.inference.fit_noise import NoisePeaks, fit_noise
+from boomdp_jax.inference.noise_level import NUM_EACH, NoiseFit
 from boomdp_jax.inference.target import StructureTarget
 
-# Student's t of so many degrees of freedom, a little wider than the curvature says.
-_FREEDOM, _WIDTH = 5.0, 1.1
+# Students' t of so many degrees of freedom; widths in terms of the curvature at the
+# peak, and the share of each.
+_FREEDOM = 5.0
+_WIDTHS, _SHARES = np.array([1.1, 2.5]), np.array([0.75, 0.25])
 _NUM_ITERATIONS = 8
+# Readings' noise of a start where the motion's takes over, by the peak's.
+_LEFT_TO_READINGS = 0.2
+# Least share of a peak, and distance at which two are one, in logarithms.
+_LEAST_SHARE, _SAME = 0.1, 0.5
 
 
 class NoiseProposal(NamedTuple):
-    """A multivariate t of the logarithms of noise for each group of draws.
+    """A mixture of multivariate t of the logarithms of noise for each group of draws.
 
     A group has the draws of one object and structure.
     """
 
+    log_share: np.ndarray
+    """`[group, component]`; minus infinity where a group has fewer."""
     center: np.ndarray
-    """`[group, number]`."""
+    """`[group, component, number]`."""
     lower: np.ndarray
-    """Cholesky factor of the inverse scale matrix, `[group, number, number]`."""
+    """Cholesky factor of the inverse scale matrix, `[group, component, number,
+    number]`."""
 
     @classmethod
     def fit(
@@ -40,29 +55,92 @@ class NoiseProposal(NamedTuple):
         """
         num_groups = len(start.reading)
         order = np.lexsort((-draws.value, group))
-        best = order[np.searchsorted(group[order], np.arange(num_groups))]
-        peaks = fit_noise(targets, draws.take(best), start, _NUM_ITERATIONS)
-        lower = np.linalg.cholesky(peaks.precision / _WIDTH**2)
-        return cls(peaks.noise.vector, lower)
+        best = draws.take(order[np.searchsorted(group[order], np.arange(num_groups))])
+        first = fit_noise(targets, best, start, _NUM_ITERATIONS)
+        starts = _other_starts(first.noise.vector)
+        rows = np.tile(np.arange(num_groups), len(starts))
+        others = fit_noise(
+            targets,
+            best.take(rows),
+            NoiseFit.of_vector(starts.reshape(len(rows), -1)),
+            _NUM_ITERATIONS,
+        )
+        return cls.of_peaks(first, others)
+
+    @classmethod
+    def of_peaks(cls, first: NoisePeaks, others: NoisePeaks) -> "NoiseProposal":
+        """Cover peaks, of which some may be the same.
+
+        Args:
+            first: one of each group.
+            others: further ones, all groups after each other, any number of times.
+        """
+        num_groups = len(first.log_density)
+
+        def join(one: np.ndarray, more: np.ndarray) -> np.ndarray:
+            more = more.reshape(-1, num_groups, *one.shape[1:])
+            return np.moveaxis(np.concatenate([one[None], more]), 0, 1)
+
+        center = join(first.noise.vector, others.noise.vector)
+        precision = join(first.precision, others.precision)
+        value = join(first.log_density, others.log_density)
+        lower = np.linalg.cholesky(precision)
+        volume = np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1)
+        height = np.where(np.isfinite(value), value - volume, -np.inf)
+        height[:, 0] = np.where(np.isfinite(height[:, 0]), height[:, 0], 0.0)
+        for g, peak in np.ndindex(*height.shape):
+            gap = np.abs(center[g, :peak] - center[g, peak]).max(axis=-1)
+            if np.any((gap < _SAME) & np.isfinite(height[g, :peak])):
+                height[g, peak] = -np.inf
+        share = np.exp(height - height.max(axis=1, keepdims=True))
+        share = share / share.sum(axis=1, keepdims=True)
+        share = np.where(np.isfinite(height), np.maximum(share, _LEAST_SHARE), 0.0)
+        share = share / share.sum(axis=1, keepdims=True)
+        both = (share[:, :, None] * _SHARES).reshape(num_groups, -1)
+        scaled = lower[:, :, None] / _WIDTHS[:, None, None]
+        num = len(_WIDTHS)
+        with np.errstate(divide="ignore"):
+            return cls(
+                np.log(both),
+                np.repeat(center, num, axis=1),
+                scaled.reshape(*both.shape, *lower.shape[-2:]),
+            )
 
     def sample(self, rng: np.random.Generator, group: np.ndarray) -> np.ndarray:
         """Draw for each of a list of groups, `[draw, number]`."""
-        size = self.center.shape[1]
+        cumulative = np.cumsum(np.exp(self.log_share), axis=1)[group]
+        uniform = rng.random(len(group))[:, None] * cumulative[:, -1:]
+        component = np.sum(cumulative <= uniform, axis=1)
+        size = self.center.shape[-1]
         normal = rng.standard_normal((len(group), size))
         stretch = np.sqrt(rng.chisquare(_FREEDOM, len(group)) / _FREEDOM)
-        spread = np.linalg.inv(np.swapaxes(self.lower, 1, 2))
-        normal = normal / stretch[:, None]
-        return self.center[group] + np.einsum("nij,nj->ni", spread[group], normal)
+        spread = np.linalg.inv(np.swapaxes(self.lower, -1, -2))[group, component]
+        offset = np.einsum("nij,nj->ni", spread, normal / stretch[:, None])
+        return self.center[group, component] + offset
 
     def log_density(self, vector: np.ndarray, group: np.ndarray) -> np.ndarray:
         """Of noise `[draw, number]` for each of a list of groups."""
         size = vector.shape[1]
-        offset = vector - self.center[group]
+        offset = vector[:, None] - self.center[group]
         # lower lower^T is the precision.
-        scaled = np.einsum("nji,nj->ni", self.lower[group], offset)
-        square = np.sum(scaled**2, axis=1)
-        volume = np.log(np.diagonal(self.lower, axis1=1, axis2=2)).sum(axis=1)
+        scaled = np.einsum("ncji,ncj->nci", self.lower[group], offset)
+        square = np.sum(scaled**2, axis=-1)
+        volume = np.log(np.diagonal(self.lower, axis1=-2, axis2=-1)).sum(axis=-1)
         half = 0.5 * (_FREEDOM + size)
         constant = math.lgamma(half) - math.lgamma(0.5 * _FREEDOM)
         constant -= 0.5 * size * math.log(_FREEDOM * math.pi)
-        return volume[group] + constant - half * np.log1p(square / _FREEDOM)
+        each = volume[group] + constant - half * np.log1p(square / _FREEDOM)
+        return np.logaddexp.reduce(each + self.log_share[group], axis=1)
+
+
+def _other_starts(vector: np.ndarray) -> np.ndarray:
+    """Noise of velocity, of spin, or of both handed to the motion, `[way, group, n]`."""
+    starts = []
+    for channels in ((0,), (1,), (0, 1)):
+        moved = vector.reshape(len(vector), -1, NUM_EACH).copy()
+        for channel in channels:
+            reading = moved[..., 2 + channel].copy()
+            moved[..., 4 + channel] = np.maximum(moved[..., 4 + channel], reading)
+            moved[..., 2 + channel] = reading + np.log(_LEFT_TO_READINGS)
+        starts.append(moved.reshape(vector.shape))
+    return np.stack(starts)

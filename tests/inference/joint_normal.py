@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.scipy.linalg import solve_triangular
 
 from boomdp_jax.core.history import History
 from tests.inference.recordings import response, transition_matrix
@@ -41,7 +42,7 @@ class JointNormal(NamedTuple):
         covariance = slope @ slope.T + jnp.diag(variance[self.group])
         miss = self.value - self.mean - self.response / mass
         factor = jnp.linalg.cholesky(covariance)
-        white = jnp.linalg.solve(factor, miss)
+        white = solve_triangular(factor, miss, lower=True)
         logs = jnp.sum(jnp.log(jnp.diagonal(factor)))
         num = miss.shape[0]
         return -0.5 * jnp.sum(white**2) - logs - 0.5 * num * jnp.log(2.0 * jnp.pi)

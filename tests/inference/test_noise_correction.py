@@ -1,11 +1,11 @@
-"""Noise inferred with everything else, against NUTS on the joint normal density."""
+"""Noise inferred with everything else, against sums over the joint normal density."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 import pytest
-from numpyro.infer import MCMC, NUTS
+from scipy.optimize import minimize
 from scipy.stats import multivariate_t
 
 from boomdp_jax.inference.infer import infer
@@ -34,7 +34,10 @@ def test_prior_of_noise_is_normalised_and_is_what_is_drawn():
 
 @pytest.fixture(scope="module")
 def reference():
-    """Draws of log-mass and six log-noises by NUTS, and the log-evidence."""
+    """Mean and sd of log-mass and six log-noises, and the log-evidence.
+
+    By importance sampling from a t that is fitted a few times over.
+    """
     history = free_box(np.random.default_rng(11), 15, noise=3.0 * NOISE)
     joint = joint_normal(history)
     middle = np.log(0.1 * SCALE[2:])
@@ -48,30 +51,36 @@ def reference():
         kicks = dist.Normal(jnp.asarray(middle), 2.0).log_prob(x[5:])
         return prior + jnp.sum(kicks) + joint.log_density(jnp.exp(x[0]), x[1:])
 
-    kernel = NUTS(potential_fn=lambda x: -log_posterior(x), dense_mass=True)
-    mcmc = MCMC(
-        kernel,
-        num_warmup=300,
-        num_samples=1000,
-        num_chains=4,
-        chain_method="vectorized",
-        progress_bar=False,
+    start = jnp.asarray([np.log(3.0), *np.log(3.0 * SCALE), *middle])
+    found = minimize(
+        jax.jit(lambda x: -log_posterior(x)),
+        start,
+        jac=jax.jit(jax.grad(lambda x: -log_posterior(x))),
+        method="BFGS",
     )
-    start = jnp.asarray([np.log(3.0), *np.log(5.0 * SCALE), *middle])
-    mcmc.run(jax.random.key(0), init_params=jnp.tile(start, (4, 1)))
-    draws = np.asarray(mcmc.get_samples())
-    proposal = multivariate_t(draws.mean(0), 1.3 * np.cov(draws.T), df=6, seed=1)
-    points = proposal.rvs(20_000)
-    weight = np.asarray(jax.lax.map(log_posterior, jnp.asarray(points), batch_size=500))
-    weight = weight - proposal.logpdf(points)
-    evidence = np.logaddexp.reduce(weight) - np.log(len(weight))
-    return history, draws, evidence
+    curvature = np.asarray(jax.hessian(lambda x: -log_posterior(x))(found.x))
+    length, way = np.linalg.eigh(curvature)
+    mean, covariance = found.x, 2.0 * (way / np.maximum(length, 0.2)) @ way.T
+    density = jax.jit(jax.vmap(log_posterior))
+    for seed in range(5):
+        proposal = multivariate_t(mean, covariance, df=6, seed=seed)
+        points = proposal.rvs(8000)
+        value = [density(jnp.asarray(part)) for part in np.split(points, 16)]
+        log_weight = np.concatenate(value) - proposal.logpdf(points)
+        log_weight = np.where(np.isfinite(log_weight), log_weight, -np.inf)
+        weight = np.exp(log_weight - log_weight.max())
+        mean = np.average(points, axis=0, weights=weight)
+        covariance = 1.2 * np.cov(points.T, aweights=weight)
+    assert weight.sum() ** 2 / np.sum(weight**2) > 1000
+    evidence = np.logaddexp.reduce(log_weight) - np.log(len(weight))
+    sd = np.sqrt(np.average((points - mean) ** 2, axis=0, weights=weight))
+    return history, mean, sd, evidence
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["rj", "enumerate", "smc"])
 def test_mass_noise_and_evidence_are_those_of_the_joint_density(reference, method):
-    history, draws, evidence = reference
+    history, mean, sd, evidence = reference
     posterior = infer(jax.random.key(3), box_scene(), history, method=method)
     found = np.concatenate(
         [
@@ -81,9 +90,10 @@ def test_mass_noise_and_evidence_are_those_of_the_joint_density(reference, metho
         ],
         axis=1,
     )
-    sd = draws.std(0)
-    # Two thousand draws that count for a few hundred at least.
-    np.testing.assert_array_less(np.abs(found.mean(0) - draws.mean(0)) / sd, 0.25)
-    np.testing.assert_allclose(found.std(0), sd, rtol=0.2)
+    offset, ratio = (found.mean(0) - mean) / sd, found.std(0) / sd
+    assert abs(offset[0]) < 0.15 and abs(ratio[0] - 1.0) < 0.12
+    # Of so few readings noise has a long tail, to which few draws go.
+    np.testing.assert_array_less(np.abs(offset[1:]), 0.4)
+    np.testing.assert_allclose(ratio[1:], 1.0, atol=0.45)
     error = posterior.diagnostics["log_evidence_error"]
     assert abs(float(posterior.log_evidence) - evidence) < 0.05 + 4.0 * error

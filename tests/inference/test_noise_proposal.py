@@ -5,29 +5,34 @@ import pytest
 from scipy.stats import kstest, multivariate_t
 
 from boomdp_jax.inference.chunking import Chunking
+from boomdp_jax.inference.fit_noise import NoisePeaks
+from boomdp_jax.inference.noise_level import NoiseFit
 from boomdp_jax.inference.noise_proposal import NoiseProposal
 
 
 @pytest.fixture(scope="module")
 def proposal():
+    """Two groups, of two components and of one."""
     rng = np.random.default_rng(0)
-    factors = np.tril(rng.normal(size=(2, 3, 3))) + 3.0 * np.eye(3)
-    return NoiseProposal(rng.normal(size=(2, 3)), factors)
+    factors = np.tril(rng.normal(size=(2, 2, 3, 3))) + 3.0 * np.eye(3)
+    share = np.array([[0.3, 0.7], [1.0, 0.0]])
+    with np.errstate(divide="ignore"):
+        return NoiseProposal(np.log(share), rng.normal(size=(2, 2, 3)), factors)
 
 
-def reference(proposal: NoiseProposal, group: int):
-    lower = proposal.lower[group]
-    return multivariate_t(
-        proposal.center[group], np.linalg.inv(lower @ lower.T), df=5.0
-    )
+def component(proposal: NoiseProposal, group: int, number: int):
+    lower = proposal.lower[group, number]
+    scale = np.linalg.inv(lower @ lower.T)
+    return multivariate_t(proposal.center[group, number], scale, df=5.0)
 
 
-def test_density_is_that_of_a_t(proposal):
+def test_density_is_that_of_a_mixture_of_t(proposal):
     points = np.random.default_rng(1).normal(size=(20, 3))
     for group in range(2):
         found = proposal.log_density(points, np.full(20, group))
-        expected = reference(proposal, group).logpdf(points)
-        np.testing.assert_allclose(found, expected, rtol=1e-9)
+        share = np.exp(proposal.log_share[group])
+        each = [component(proposal, group, c).pdf(points) for c in range(2)]
+        np.testing.assert_allclose(found, np.log(share @ each), rtol=1e-9)
 
 
 def test_draws_follow_their_group(proposal):
@@ -35,7 +40,14 @@ def test_draws_follow_their_group(proposal):
     group = np.repeat([0, 1], 4000)
     draws = proposal.sample(rng, group)
     for which in range(2):
-        theirs = reference(proposal, which).rvs(4000, random_state=3)
+        num = rng.multinomial(4000, np.exp(proposal.log_share[which]))
+        theirs = np.concatenate(
+            [
+                component(proposal, which, c).rvs(num[c], random_state=3)
+                for c in range(2)
+                if num[c]
+            ]
+        )
         own = draws[group == which]
         for direction in np.eye(3):
             assert kstest(own @ direction, theirs @ direction).pvalue > 1e-4
@@ -58,3 +70,17 @@ def test_every_point_gets_its_own_result(num_points):
         np.testing.assert_array_equal(chunks.in_order(found), value)
     else:
         assert not found
+
+
+def test_peaks_that_are_the_same_are_covered_once():
+    peaks = NoisePeaks(
+        NoiseFit.of_vector(np.zeros((1, 6))), np.eye(6)[None], np.array([3.0])
+    )
+    far = np.zeros((2, 6))
+    far[1, 3] = 2.0
+    others = NoisePeaks(
+        NoiseFit.of_vector(far), np.tile(np.eye(6), (2, 1, 1)), np.array([3.0, 3.0])
+    )
+    found = NoiseProposal.of_peaks(peaks, others)
+    share = np.exp(found.log_share[0]).reshape(3, 2).sum(axis=1)
+    np.testing.assert_allclose(share, [0.5, 0.0, 0.5])
