@@ -121,7 +121,7 @@ def infer_batch(
             f"histories: expected one per scene, {len(specs)}, got {len(histories)}"
         )
     for spec, history in zip(specs, histories, strict=True):
-        _check(spec, history)
+        check_history(spec, history)
     if method in ("nuts", "svi"):
         counts = {"num_samples": num_samples, "num_chains": num_chains}
         if method == "nuts":
@@ -176,7 +176,8 @@ def infer_batch(
     ]
 
 
-def _check(spec: SceneSpec, history: History) -> None:
+def check_history(spec: SceneSpec, history: History) -> None:
+    """Raise ValueError unless a history is about a scene that can be inferred."""
     if history.num_bodies != spec.num_bodies:
         raise ValueError(
             f"{spec.source}: history: expected {spec.num_bodies} bodies, got "

@@ -47,8 +47,8 @@ class NoiseLevel(eqx.Module):
 class Estimate(NamedTuple):
     """What a filter knows of the state at one instant."""
 
-    mean: Float[Array, "body 6"]
-    covariance: Float[Array, "channel channel"]
+    mean: Float[Array, "*batch body 6"]
+    covariance: Float[Array, "*batch channel channel"]
 
 
 class FilteredRow(NamedTuple):
@@ -68,8 +68,8 @@ class Filtered(NamedTuple):
     log_likelihood: FloatScalar
     starts: Float[Array, "time body 6"]
     """Mean before the first reading of each row."""
-    last: Estimate
-    """After the last row."""
+    after: Estimate
+    """After each row, leading axis `time`."""
 
 
 def channel_scale(reading):
@@ -184,8 +184,8 @@ def extended_filter(
         estimate, found = row_filter(estimate, row)
         density = found.log_likelihood
         density = density if row.weight is None else row.weight * density
-        return (estimate, total + density), (found.gains, found.start)
+        return (estimate, total + density), (found.gains, found.start, estimate)
 
     carry = (row_filter.start(), jnp.zeros(()))
-    (last, total), (gains, starts) = jax.lax.scan(advance, carry, data.rows)
-    return Filtered(gains, total, starts, last)
+    (_, total), (gains, starts, after) = jax.lax.scan(advance, carry, data.rows)
+    return Filtered(gains, total, starts, after)
