@@ -11,17 +11,17 @@ has to be decided in between. Chopin (2002), A sequential particle filter method
 static models; Gilks and Berzuini (2001), Following a moving target.
 """
 
+import functools
 import time
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from boomdp_jax.core.arrays import BoolScalar, IntScalar, Key, on_device
+from boomdp_jax.core.arrays import BoolScalar, Key, on_device
 from boomdp_jax.core.history import History, make_history
 from boomdp_jax.inference.compile_ahead import signature
 from boomdp_jax.inference.components import independent_blocks
@@ -34,47 +34,18 @@ from boomdp_jax.inference.online_refit import (
     prior_belief,
     refit_block,
 )
-from boomdp_jax.inference.online_rows import append_row, new_row, shift_rows
+from boomdp_jax.inference.online_refresh import LEAVING_SHARE, OnlineInfo, refresh
 from boomdp_jax.inference.online_state import BeliefState, BlockBelief
-from boomdp_jax.inference.online_step import (
-    BlockInfo,
-    drop_block_rows,
-    refresh_block,
-)
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.physics.scene_spec import SceneSpec
 from boomdp_jax.physics.state import State
 
-# Share of a full table that leaves at once: each time, all particles have to be weighed
-# anew by all rows.
-_LEAVING = 8
 # First refit, in transitions; then at every doubling.
 _FIRST_REFIT = 8
 # A refit for lack of particles in effect comes no sooner than so many transitions after
 # the last, and after this share of the table has been renewed.
 _REST, _RENEWED = 4, 0.25
 _MULTIPLE = 16
-
-
-class OnlineInfo(NamedTuple):
-    """What one transition did to a belief; a pytree."""
-
-    blocks: BlockInfo
-    """With a leading axis `block`, in the order of `OnlineBelief.blocks`."""
-    needs_refit: BoolScalar
-    """For one of the three reasons below."""
-    is_stale: BoolScalar
-    """The table has doubled, or been renewed, since the last refit."""
-    is_degenerate: Bool[Array, " block"]
-    """Next to no particle agrees with the readings."""
-    is_surprised: Bool[Array, " block"]
-    """Readings have looked unlike what was expected for several rows."""
-    is_finite: BoolScalar
-    """False where the wrench was not: the transition told nothing."""
-    num_rows: IntScalar
-    """Rows in the table after the step."""
-    num_left: IntScalar
-    """Oldest rows that left a full table in this step."""
 
 
 class RefitInfo(NamedTuple):
@@ -140,8 +111,10 @@ class OnlineBelief:
         Raises:
             ValueError: a number out of range; a scene that `infer` refuses.
         """
-        if capacity < _LEAVING:
-            raise ValueError(f"capacity: expected at least {_LEAVING}, got {capacity}")
+        if capacity < LEAVING_SHARE:
+            raise ValueError(
+                f"capacity: expected at least {LEAVING_SHARE}, got {capacity}"
+            )
         if num_particles < _MULTIPLE or num_particles % _MULTIPLE:
             raise ValueError(
                 f"num_particles: expected a multiple of {_MULTIPLE}, got "
@@ -180,7 +153,16 @@ class OnlineBelief:
         for index, block in enumerate(self._blocks):
             groups.setdefault(signature(block.target), []).append(index)
         self._groups = list(groups.values())
-        self._step = jax.jit(self._refresh)
+        self._step = jax.jit(
+            functools.partial(
+                refresh,
+                tuple(
+                    tuple(self._blocks[index].bodies for index in group)
+                    for group in self._groups
+                ),
+                self._settings.forgetting,
+            )
+        )
 
     @property
     def blocks(self) -> list[tuple[str, ...]]:
@@ -393,81 +375,3 @@ class OnlineBelief:
             return on_device(array, array.dtype)
 
         return jax.tree.map(put, self._empty, history)
-
-    def _refresh(self, belief, state, wrench, next_state, dt, starts_episode):
-        """`step`, to be compiled."""
-        num_left = self.capacity // _LEAVING
-        is_full = belief.num_rows >= self.capacity
-        belief = jax.lax.cond(
-            is_full, lambda b: self._without_oldest(b, num_left), lambda b: b, belief
-        )
-        index = belief.num_rows
-        new = new_row(
-            belief.history, index, state, wrench, next_state, dt, starts_episode
-        )
-        key, step_key = jax.random.split(belief.key)
-        blocks, infos = [], []
-        for number, (group, stacked) in enumerate(
-            zip(self._groups, belief.blocks, strict=True)
-        ):
-            bodies = jnp.asarray([self._blocks[i].bodies for i in group])
-            keys = jax.random.split(jax.random.fold_in(step_key, number), len(group))
-            found = _map_members(
-                lambda key, block, body: refresh_block(
-                    key, block, new, body, index, is_full, self._settings.forgetting
-                ),
-                (keys, stacked, bodies),
-            )
-            blocks.append(found[0])
-            infos.append(found[1])
-        info = jax.tree.map(lambda *parts: jnp.concatenate(parts), *infos)
-        num_seen = belief.num_seen + 1
-        least = max(8.0, self._settings.num_particles / 64)
-        is_degenerate = info.effective_sample_size < least
-        is_degenerate = is_degenerate & (num_seen >= belief.refit_after)
-        is_stale = num_seen >= belief.refit_at
-        needs_refit = is_stale | jnp.any(is_degenerate) | jnp.any(info.is_surprised)
-        belief = BeliefState(
-            key=key,
-            history=append_row(belief.history, index, new),
-            num_rows=index + 1,
-            num_seen=num_seen,
-            refit_at=belief.refit_at,
-            refit_after=belief.refit_after,
-            blocks=tuple(blocks),
-        )
-        return belief, OnlineInfo(
-            blocks=info,
-            needs_refit=needs_refit,
-            is_stale=is_stale,
-            is_degenerate=is_degenerate,
-            is_surprised=info.is_surprised,
-            is_finite=jnp.all(jnp.isfinite(wrench)),
-            num_rows=index + 1,
-            num_left=jnp.where(is_full, num_left, 0),
-        )
-
-    def _without_oldest(self, belief: BeliefState, num: int) -> BeliefState:
-        """A full table without its oldest rows."""
-        blocks = tuple(
-            _map_members(lambda block: drop_block_rows(block, num), (stacked,))
-            for stacked in belief.blocks
-        )
-        history = shift_rows(belief.history, num)
-        return eqx.tree_at(
-            lambda s: (s.blocks, s.history, s.num_rows),
-            belief,
-            (blocks, history, belief.num_rows - num),
-        )
-
-
-def _map_members(function: Callable[..., Any], members: tuple) -> Any:
-    """A function of each member of a group, one after the other.
-
-    Not side by side: what is done under a condition would then be done always. A loop
-    around a single member would only cost compile time.
-    """
-    if jax.tree.leaves(members)[0].shape[0] > 1:
-        return jax.lax.map(lambda member: function(*member), members)
-    found = function(*jax.tree.map(lambda leaf: leaf[0], members))
-    return jax.tree.map(lambda leaf: leaf[None], found)

@@ -150,11 +150,11 @@ def tally_row(gains: Gains) -> Tally:
         gains: for the row, with a leading structure axis.
     """
 
-    def one(gains: Gains) -> Tally:
+    def one(gains: Gains) -> tuple[Array, Array]:
         counts = gains.counts.reshape(1, 2, -1, 6)
-        return Tally(group_sums(counts), gains.log_volume)
+        return group_sums(counts), gains.log_volume
 
-    return jax.vmap(one)(jax.tree.map(lambda leaf: leaf[:, None], gains))
+    return Tally(*jax.vmap(one)(jax.tree.map(lambda leaf: leaf[:, None], gains)))
 
 
 def log_likelihoods(
