@@ -15,7 +15,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from boomdp_jax.core.arrays import Key, on_device
 from boomdp_jax.core.history import History
@@ -35,6 +34,7 @@ from boomdp_jax.inference.online_state import (
     ParticleSet,
     Suspicion,
 )
+from boomdp_jax.inference.online_window import in_whole_table, windowed
 from boomdp_jax.inference.structure_draws import start_mixtures
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.tempered_smc import temper
@@ -43,9 +43,6 @@ from boomdp_jax.physics.scene_spec import SceneSpec
 
 # Draws of each round that adapts the mixture, and rounds: tempering comes after.
 _NUM_DRAWS, _NUM_ROUNDS = 1024, 2
-# A fit of so few rows that they fit into this share of the table is made on a table of
-# that size: its cost is in proportion. More sizes would have to be compiled as well.
-_SMALL_TABLE = 4
 # A change is looked for when so many rows have come since readings grew odd, again
 # after twice as many, and no more after the last number.
 FIRST_TEST, _LAST_TEST = 4, 64
@@ -158,16 +155,20 @@ def refit_block(
         and (bool(suspicion.is_open) or float(suspicion.log_factor) > 0)
     )
     all_key, after_key, before_key, temper_key = jax.random.split(key, 4)
-    whole = _windowed(history, begin, num_rows, since if is_asked else None)
+    whole = windowed(history, begin, num_rows, since if is_asked else None)
     account = _fit(all_key, settings, bodies, whole)
     log_odds, is_changed, next_test = None, False, FIRST_TEST
     is_open = False
     if is_asked:
         after = _fit(
-            after_key, settings, bodies, _windowed(history, since, num_rows, None)
+            after_key, settings, bodies, windowed(history, since, num_rows, None)
         )
         before = _fit(
-            before_key, settings, bodies, _windowed(history, begin, since, None)
+            before_key,
+            settings,
+            bodies,
+            windowed(history, begin, since, None),
+            age=num_after,
         )
         log_odds = after.log_evidence + before.log_evidence - account.log_evidence
         log_odds += np.log(settings.change_rate)
@@ -209,7 +210,11 @@ def refit_block(
 
 
 def make_online_block(
-    settings: RefitSettings, bodies: tuple[int, ...], history: History
+    settings: RefitSettings,
+    bodies: tuple[int, ...],
+    history: History,
+    *,
+    age: int = 0,
 ) -> Block:
     """A block whose rows count as forgetting has it.
 
@@ -217,76 +222,29 @@ def make_online_block(
         settings: what stays the same.
         bodies: indices of the block's bodies in the scene.
         history: readings of the whole scene.
+        age: transitions since its last row.
     """
     weight = None
     if settings.forgetting < 1.0:
         num_rows = int(np.asarray(history.mask).nonzero()[0].max(initial=-1)) + 1
-        age = np.maximum(num_rows - 1 - np.arange(history.capacity), 0)
-        weight = settings.forgetting**age
+        behind = np.maximum(num_rows - 1 - np.arange(history.capacity), 0)
+        weight = settings.forgetting ** (age + behind)
     return make_block(
         settings.spec, bodies, history, is_uniform=settings.is_uniform, weight=weight
     )
 
 
-def _windowed(history: History, begin: int, end: int, cut: int | None) -> History:
-    """Rows from one to another, in a table of their own; a track starts at `cut`."""
-    small = -(-history.capacity // _SMALL_TABLE)
-    capacity = small if end - begin <= small else history.capacity
-    num = end - begin
-
-    def take(leaf: Array) -> Array:
-        array = np.zeros((capacity, *leaf.shape[1:]), leaf.dtype)
-        array[:num] = np.asarray(leaf)[begin:end]
-        return on_device(array, array.dtype)
-
-    window = jax.tree.map(take, history)
-    dt = np.full(capacity, float(np.asarray(history.dt)[0]))
-    dt[:num] = np.asarray(history.dt)[begin:end]
-    episode = np.asarray(window.episode)
-    if cut is not None:
-        episode = episode + (np.arange(capacity) >= cut - begin)
-    return eqx.tree_at(
-        lambda h: (h.dt, h.episode),
-        window,
-        (on_device(dt, history.dt.dtype), on_device(episode, history.episode.dtype)),
-    )
-
-
-def _in_whole_table(
-    targets: StructureTarget, starts: np.ndarray, begin: int, capacity: int
-) -> tuple[StructureTarget, np.ndarray]:
-    """A fitted target's rows, and the states before them, at their places."""
-    likelihood: Any = targets.log_likelihood
-    data = likelihood.data
-
-    def put(leaf: Array, axis: int) -> Array:
-        array = np.moveaxis(np.asarray(leaf), axis, 0)[: capacity - begin]
-        out = np.zeros((capacity, *array.shape[1:]), array.dtype)
-        out[begin : begin + len(array)] = array
-        return on_device(np.moveaxis(out, 0, axis), array.dtype)
-
-    is_uniform = data.steps.dt.ndim == 1
-    dt = data.steps.dt
-    placed = jax.tree.map(
-        lambda leaf: put(leaf, 1),
-        eqx.tree_at(lambda d: d.steps.dt, data, data.is_start),
-    )
-    placed = eqx.tree_at(lambda d: d.steps.dt, placed, dt if is_uniform else put(dt, 1))
-    gains = jax.tree.map(lambda leaf: put(leaf, 2), likelihood.gains)
-    targets = eqx.tree_at(
-        lambda t: (t.log_likelihood.data, t.log_likelihood.gains),
-        targets,
-        (placed, gains),
-    )
-    return targets, np.asarray(put(on_device(starts, starts.dtype), 0))
-
-
 def _fit(
-    key: Key, settings: RefitSettings, bodies: tuple[int, ...], history: History
+    key: Key,
+    settings: RefitSettings,
+    bodies: tuple[int, ...],
+    history: History,
+    *,
+    age: int = 0,
 ) -> _Account:
-    """Modes, mixture and evidence on the rows of a history."""
+    """Modes, mixture and evidence on the rows of a history that ended some time ago."""
     fit_key, draw_key = jax.random.split(key)
-    block = make_online_block(settings, bodies, history)
+    block = make_online_block(settings, bodies, history, age=age)
     found = find_modes(fit_key, stack_blocks([block]), settings.fit)
     mixtures, evidence = adapt_mixtures(
         host_generator(draw_key),
@@ -331,7 +289,7 @@ def _assemble(
     # Rows beyond the last one are padding.
     estimate = jax.tree.map(lambda leaf: leaf[:, max(end - begin, 1) - 1], found.after)
     starts = np.asarray(found.starts)[int(np.argmax(share))]
-    targets, starts = _in_whole_table(targets, starts, begin, capacity)
+    targets, starts = in_whole_table(targets, starts, begin, capacity)
     target = jax.tree.map(lambda leaf: leaf[0], targets)
     places = on_device(structure, np.dtype(np.int32)), on_device(z, dtype)
     bounds = on_device(begin, integer), on_device(end, integer)

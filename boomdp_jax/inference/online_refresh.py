@@ -12,6 +12,7 @@ from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar
 from boomdp_jax.inference.online_rows import append_row, new_row, shift_rows
 from boomdp_jax.inference.online_state import BeliefState
 from boomdp_jax.inference.online_step import (
+    ALARM,
     BlockInfo,
     drop_block_rows,
     refresh_block,
@@ -32,7 +33,8 @@ class OnlineInfo(NamedTuple):
     blocks: BlockInfo
     """With a leading axis `block`, in the order of `OnlineBelief.blocks`."""
     needs_refit: BoolScalar
-    """For one of the three reasons below."""
+    """For one of the three reasons below, the first two of which wait while readings
+    have been odd for too few rows to look for a change."""
     is_stale: BoolScalar
     """The table has doubled, or been renewed, since the last refit."""
     is_degenerate: Bool[Array, " block"]
@@ -99,6 +101,10 @@ def refresh(
     is_degenerate = info.effective_sample_size < fewest
     is_degenerate = is_degenerate & (num_seen >= belief.refit_after)
     is_stale = num_seen >= belief.refit_at
+    # Where odd readings are too few yet to look for a change, a fit would take two
+    # worlds for one.
+    is_waiting = jnp.any((info.log_surprise > ALARM) & ~info.is_surprised)
+    is_due = (is_stale | jnp.any(is_degenerate)) & ~is_waiting
     belief = BeliefState(
         key=key,
         history=append_row(belief.history, index, new),
@@ -110,7 +116,7 @@ def refresh(
     )
     return belief, OnlineInfo(
         blocks=info,
-        needs_refit=is_stale | jnp.any(is_degenerate | info.is_surprised),
+        needs_refit=is_due | jnp.any(info.is_surprised),
         is_stale=is_stale,
         is_degenerate=is_degenerate,
         is_surprised=info.is_surprised,

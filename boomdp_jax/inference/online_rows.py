@@ -36,7 +36,8 @@ def new_row(
     """Sort out what was read, and how the row hangs together with the one before.
 
     Readings that are not finite count as missing. A wrench that is not finite leaves
-    nothing that could be learnt from the row: all its readings count as missing.
+    nothing that could be learnt from the row: all its readings count as missing, and
+    what was known of the state is lost.
 
     Args:
         history: the table so far.
@@ -56,7 +57,7 @@ def new_row(
     is_same = jnp.all(state == history.next_state[before]) & jnp.all(
         first == history.next_state_mask[before]
     )
-    starts_episode = starts_episode | (num_rows == 0)
+    starts_episode = starts_episode | (num_rows == 0) | ~is_pushed
     return NewRow(
         state=state,
         action=jnp.where(is_pushed, action, 0.0).astype(history.action.dtype),

@@ -52,9 +52,11 @@ from boomdp_jax.inference.online_state import (
 _MOVED_ROWS, _ROWS_OF_A_MOVE = 65536, 32
 # Resampling comes where fewer particles than this share are left in effect.
 _KEPT_SHARE = 0.5
-# The alternative by which surprise is measured; no single row counts for more nats than
-# the third number, so that one bad reading alone alarms nobody.
-_MISFIT, _ALARM, _MOST_NATS = 5.0, 10.0, 8.0
+# The alternative by which surprise is measured: readings so many times as far off. One
+# row counts for no more nats than this, so that a single bad reading alarms nobody.
+_MISFIT, _MOST_NATS = 5.0, 8.0
+ALARM = 10.0
+"""Cumulative log Bayes factor from which on readings count as odd."""
 
 
 class BlockInfo(NamedTuple):
@@ -157,7 +159,7 @@ def refresh_block(
     moved = move_particles(move_key, block, index + 1, count)
     suspicion = _watch(block.suspicion, weights, index)
     num_after = index + 1 - suspicion.since
-    is_alarmed = (suspicion.log_factor > _ALARM) | suspicion.is_open
+    is_alarmed = (suspicion.log_factor > ALARM) | suspicion.is_open
     is_surprised = (
         is_alarmed & (suspicion.since >= 0) & (num_after >= suspicion.test_after)
     )

@@ -203,7 +203,7 @@ def test_the_mixture_is_fitted_to_the_particles_of_each_structure():
         num_moves=integer,
         suspicion=Suspicion(zero, integer, integer, jnp.asarray(False)),
     )
-    fitted = fit_mixture(block)
+    fitted = jax.jit(fit_mixture)(block)
     share = np.bincount(structure, minlength=6) / num
     base = np.exp(np.asarray(mixture.structure_log_weight(target)))
     whole = np.exp(np.asarray(fitted.structure_log_weight(target)))
