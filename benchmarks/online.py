@@ -162,8 +162,8 @@ def check_answer(reporter: Reporter, online: OnlineBelief, rows) -> None:
             metric=f"{level} of mass, off by",
             value=off,
             unit="posterior sd",
-            target=0.4,
-            met=off < 0.4,
+            target=0.5,
+            met=off < 0.5,
         )
 
 

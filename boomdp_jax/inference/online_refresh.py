@@ -36,7 +36,7 @@ class OnlineInfo(NamedTuple):
     """For one of the three reasons below, the first two of which wait while readings
     have been odd for too few rows to look for a change."""
     is_stale: BoolScalar
-    """The table has doubled, or been renewed, since the last refit."""
+    """The table has grown by half, or been half renewed, since the last refit."""
     is_degenerate: Bool[Array, " block"]
     """Next to no particle agrees with the readings."""
     is_surprised: Bool[Array, " block"]

@@ -150,7 +150,8 @@ def test_a_belief_agrees_with_inference_on_all_rows_at_once(online, name):
         assert abs(difference) < 0.12, structure
     mass, expected = (x.to_json()["bodies"]["box"]["mass"] for x in (posterior, batch))
     for level in ("q05", "q50", "q95"):
-        assert abs(mass[level] - expected[level]) < 0.4 * expected["sd"]
+        # Of the belief's gains, some are those of fits of fewer rows.
+        assert abs(mass[level] - expected[level]) < 0.5 * expected["sd"]
     assert 0.75 < mass["sd"] / expected["sd"] < 1.3
 
 
