@@ -22,6 +22,7 @@ _LAZY = {
     "load_scene": "boomdp_jax.physics",
     "rollout": "boomdp_jax.physics",
     "step": "boomdp_jax.physics",
+    "OnlineBelief": "boomdp_jax.inference",
     "Posterior": "boomdp_jax.inference",
     "infer": "boomdp_jax.inference",
     "infer_batch": "boomdp_jax.inference",
@@ -31,6 +32,7 @@ _LAZY = {
 
 __all__ = [
     "History",
+    "OnlineBelief",
     "Params",
     "Posterior",
     "Scene",

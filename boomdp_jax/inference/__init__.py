@@ -19,6 +19,11 @@ from boomdp_jax.inference.laplace_mixture import LaplaceMixture as LaplaceMixtur
 from boomdp_jax.inference.numpyro_model import ObjectModel as ObjectModel
 from boomdp_jax.inference.numpyro_model import make_model as make_model
 from boomdp_jax.inference.nuts import run_nuts as run_nuts
+from boomdp_jax.inference.online import Observed as Observed
+from boomdp_jax.inference.online import OnlineBelief as OnlineBelief
+from boomdp_jax.inference.online import RefitInfo as RefitInfo
+from boomdp_jax.inference.online_refresh import OnlineInfo as OnlineInfo
+from boomdp_jax.inference.online_state import BeliefState as BeliefState
 from boomdp_jax.inference.posterior import Posterior as Posterior
 from boomdp_jax.inference.posterior import load_posterior as load_posterior
 from boomdp_jax.inference.predict import predict as predict
@@ -30,13 +35,18 @@ from boomdp_jax.inference.target import StructureTarget as StructureTarget
 
 __all__ = [
     "METHODS",
+    "BeliefState",
     "InformationGain",
     "KindPrior",
     "KindsPosterior",
     "LaplaceMixture",
     "LearntKinds",
     "ObjectModel",
+    "Observed",
+    "OnlineBelief",
+    "OnlineInfo",
     "Posterior",
+    "RefitInfo",
     "StructureKernel",
     "StructureTarget",
     "Sweep",

@@ -1,5 +1,6 @@
 """One block of bodies as a sampling problem: scene, history and prior made a target."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -32,7 +33,14 @@ class Block(NamedTuple):
     target: StructureTarget
 
 
-def make_block(spec: SceneSpec, bodies: tuple[int, ...], history: History) -> Block:
+def make_block(
+    spec: SceneSpec,
+    bodies: tuple[int, ...],
+    history: History,
+    *,
+    is_uniform: bool | None = None,
+    weight: np.ndarray | None = None,
+) -> Block:
     """Set up the posterior of a block.
 
     Its likelihood starts out as the one-step likelihood; a fit then gives it the gains
@@ -42,6 +50,9 @@ def make_block(spec: SceneSpec, bodies: tuple[int, ...], history: History) -> Bl
         spec: the scene.
         bodies: which of its bodies.
         history: of the whole scene.
+        is_uniform: whether all steps are equally long; default: as the history has it.
+        weight: as how many times its likelihood each row counts, `[time]`; default: as
+            one.
 
     Returns:
         The block.
@@ -58,8 +69,12 @@ def make_block(spec: SceneSpec, bodies: tuple[int, ...], history: History) -> Bl
         surroundings=surroundings(spec, bodies, layout, poses),
         scene=_block_scene(spec.scene, bodies),
     )
-    dt = np.asarray(history.dt)[np.asarray(history.mask)]
-    data = track_data(history, bodies, bool(dt.size == 0 or np.all(dt == dt[0])))
+    if is_uniform is None:
+        dt = np.asarray(history.dt)[np.asarray(history.mask)]
+        is_uniform = bool(dt.size == 0 or np.all(dt == dt[0]))
+    data = track_data(history, bodies, is_uniform)
+    if weight is not None:
+        data = dataclasses.replace(data, weight=on_device(weight))
     scale = np.asarray(coordinates.scales.noise)
     reference = np.tile(scale[None], (len(bodies), 1))
     gains = one_step_gains(data, channel_scale(reference))

@@ -57,7 +57,7 @@ def _evaluate_chunks(chunks: _Chunks, z):
 
     def one_chunk(chunk, z):
         likelihood, gains, reference, active = chunk
-        log_volume = gains.log_volume
+        log_volume = likelihood.log_volume(gains)
 
         def one_point(z):
             found = likelihood.innovations(z, active, gains)

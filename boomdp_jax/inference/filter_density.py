@@ -48,38 +48,27 @@ def filter_density(
 
     def advance(carry, row):
         state, covariance, total = carry
-        is_start, is_second, start, first, first_mask, action, last, last_mask, dt = row
-        seen = first_mask.reshape(-1)
+        seen = row.first_mask.reshape(-1)
         at_start = jnp.diag(jnp.where(seen > 0, scale, unknown) ** 2)
-        state = jnp.where(is_start > 0, start, state)
-        covariance = jnp.where(is_start > 0, at_start, covariance)
-        miss = channel_difference(first, state).reshape(-1)
-        shift, covariance, density = correct(
-            covariance, miss, is_second * seen, variance
+        state = jnp.where(row.is_start > 0, row.start, state)
+        covariance = jnp.where(row.is_start > 0, at_start, covariance)
+        miss = channel_difference(row.first, state).reshape(-1)
+        shift, covariance, first_density = correct(
+            covariance, miss, row.is_second * seen, variance
         )
         state = state + shift.reshape(state.shape)
-        total = total + density
         points = jnp.concatenate([state[None], state[None] + offsets])
-        images = jax.vmap(lambda x: predict(x, action, dt))(points)
+        images = jax.vmap(lambda x: predict(x, row.action, row.dt))(points)
         state = images[0]
         rise = (images[1:] - state[None]).reshape(num, num)
-        miss = channel_difference(last, state).reshape(-1)
-        shift, covariance, density = move_and_correct(
-            covariance, rise, scale, kick, miss, last_mask.reshape(-1), variance
+        miss = channel_difference(row.last, state).reshape(-1)
+        shift, covariance, last_density = move_and_correct(
+            covariance, rise, scale, kick, miss, row.last_mask.reshape(-1), variance
         )
         state = state + shift.reshape(state.shape)
+        density = first_density + last_density
+        density = density if row.weight is None else row.weight * density
         return (state, covariance, total + density), None
 
-    rows = (
-        data.is_start,
-        data.is_second,
-        data.start,
-        steps.state,
-        data.first_mask,
-        steps.action,
-        steps.next_state,
-        data.last_mask,
-        steps.dt if steps.dt.ndim else None,
-    )
     carry = (jnp.zeros((num_bodies, 6)), jnp.eye(num), jnp.zeros(()))
-    return jax.lax.scan(advance, carry, rows)[0][2]
+    return jax.lax.scan(advance, carry, data.rows)[0][2]

@@ -53,7 +53,7 @@ class FilteredLikelihood(eqx.Module):
         gains = self.gains_of(structure)
         found = self.innovations(z, active, gains)
         return self.log_marginal(
-            found.statistics, gains.log_volume, self.reference[structure]
+            found.statistics, self.log_volume(gains), self.reference[structure]
         )
 
     def structure_index(self, active: Bool[Array, " slot"]) -> IntScalar:
@@ -71,12 +71,27 @@ class FilteredLikelihood(eqx.Module):
         """Whitened innovations at a hypothesis, and their sums of squares."""
         params = self.coordinates(z, active)
         whitened = innovations(self.coordinates.scene, params, self.data, gains)
-        num_bodies = whitened.shape[-2]
-        counts = gains.counts.reshape(-1, 2, num_bodies, 6)
+        weight = self.data.weight
+        if weight is not None:
+            whitened = whitened * jnp.sqrt(weight)[:, None, None, None]
         return Innovations(
             whitened,
-            NoiseStatistics(_group_sums(counts), _group_sums(whitened**2)),
+            NoiseStatistics(self.num_counted(gains), group_sums(whitened**2)),
         )
+
+    def num_counted(self, gains: Gains) -> Float[Array, "body 4"]:
+        """How many innovations of each channel group count."""
+        counts = gains.counts
+        if self.data.weight is not None:
+            counts = counts * self.data.weight[:, None, None]
+        return group_sums(counts.reshape(len(counts), 2, -1, 6))
+
+    def log_volume(self, gains: Gains) -> FloatScalar:
+        """Log-determinant of all whitenings, each row's as often as it counts."""
+        each = gains.log_volumes
+        if self.data.weight is not None:
+            each = each * self.data.weight
+        return jnp.sum(each)
 
     def log_marginal(
         self,
@@ -102,7 +117,7 @@ def without_gains(likelihood: FilteredLikelihood) -> FilteredLikelihood:
     )
 
 
-def _group_sums(values: Float[Array, "time 2 body 6"]) -> Float[Array, "body 4"]:
+def group_sums(values: Float[Array, "time 2 body 6"]) -> Float[Array, "body 4"]:
     """Sum over readings and over the channels of each group."""
     total = jnp.sum(values, axis=(0, 1))
     return jnp.stack(

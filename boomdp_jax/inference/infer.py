@@ -133,7 +133,7 @@ def infer_batch(
             f"histories: expected one per scene, {len(specs)}, got {len(histories)}"
         )
     for spec, history in zip(specs, histories, strict=True):
-        _check(spec, history)
+        check_history(spec, history)
     if method not in ("nuts", "svi") and structure is not None:
         raise ValueError(f"structure: expected none with method {method!r}")
     with spread_over(mesh):
@@ -215,7 +215,8 @@ def seed_of(key: Key) -> int:
     return int.from_bytes(words.astype(">u4").tobytes(), "big")
 
 
-def _check(spec: SceneSpec, history: History) -> None:
+def check_history(spec: SceneSpec, history: History) -> None:
+    """Raise ValueError unless a history is about a scene that can be inferred."""
     if history.num_bodies != spec.num_bodies:
         raise ValueError(
             f"{spec.source}: history: expected {spec.num_bodies} bodies, got "

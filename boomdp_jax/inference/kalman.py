@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar
-from boomdp_jax.inference.track_data import TrackData
+from boomdp_jax.inference.track_data import TrackData, TrackRow
 from boomdp_jax.inference.tracking import Gains, channel_difference, predictor
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
@@ -44,11 +44,32 @@ class NoiseLevel(eqx.Module):
     """Sd of the change of velocity [m/s] and spin [rad/s] that a step starts with."""
 
 
+class Estimate(NamedTuple):
+    """What a filter knows of the state at one instant."""
+
+    mean: Float[Array, "*batch body 6"]
+    covariance: Float[Array, "*batch channel channel"]
+
+
+class FilteredRow(NamedTuple):
+    """What a filter finds in one row."""
+
+    gains: Gains
+    log_likelihood: FloatScalar
+    """Log-density of the row's readings given all before."""
+    start: Float[Array, "body 6"]
+    """Mean before the first reading of the row."""
+
+
 class Filtered(NamedTuple):
     """What a filter finds."""
 
     gains: Gains
     log_likelihood: FloatScalar
+    starts: Float[Array, "time body 6"]
+    """Mean before the first reading of each row."""
+    after: Estimate
+    """After each row, leading axis `time`."""
 
 
 def channel_scale(reading):
@@ -68,33 +89,65 @@ def start_scale(num_bodies: int):
     return jnp.tile(jnp.asarray(_UNKNOWN_START), num_bodies)
 
 
-def extended_filter(
-    scene: Scene, params: Params, data: TrackData, noise: NoiseLevel
-) -> Filtered:
-    """Filter all rows at one hypothesis.
+class RowFilter:
+    """Takes a hypothesis's estimate of the state from row to row."""
 
-    Args:
-        scene: the block's scene.
-        params: the hypothesis.
-        data: the block's readings.
-        noise: of readings and motion.
+    def __init__(
+        self,
+        scene: Scene,
+        params: Params,
+        dt: Float[Array, " time"] | Float[Array, ""],
+        noise: NoiseLevel,
+    ):
+        """Work out what does not change from row to row.
 
-    Returns:
-        Gains, and the log-density of all readings but the first of each track.
-    """
-    steps = data.steps
-    predict = predictor(scene, params, steps.dt)
-    num_bodies = steps.state.shape[1]
-    num = 6 * num_bodies
-    scale = channel_scale(noise.reading).reshape(-1)
-    variance = jnp.diag(scale**2)
-    kick = kick_scale(noise.impulse).reshape(-1)
-    unknown = start_scale(num_bodies)
-    offsets = jnp.diag(scale).reshape(num, num_bodies, 6)
+        Args:
+            scene: the block's scene.
+            params: the hypothesis.
+            dt: as `TrackData.steps` has it.
+            noise: of readings and motion.
+        """
+        num_bodies = noise.reading.shape[0]
+        self._num = 6 * num_bodies
+        self._predict = predictor(scene, params, dt)
+        self._scale = channel_scale(noise.reading).reshape(-1)
+        self._variance = jnp.diag(self._scale**2)
+        self._kick = kick_scale(noise.impulse).reshape(-1)
+        self._unknown = start_scale(num_bodies)
+        self._offsets = jnp.diag(self._scale).reshape(self._num, num_bodies, 6)
 
-    def update(state, covariance, reading, mask):
+    def start(self) -> Estimate:
+        """To begin with, before any row; the first one starts a track."""
+        return Estimate(jnp.zeros((self._num // 6, 6)), jnp.eye(self._num))
+
+    def __call__(self, before: Estimate, row: TrackRow) -> tuple[Estimate, FilteredRow]:
+        """Filter one row."""
+        begin, num = row.is_start > 0, self._num
+        first_sd = jnp.where(row.first_mask.reshape(-1) > 0, self._scale, self._unknown)
+        estimate = Estimate(
+            jnp.where(begin, row.start, before.mean),
+            jnp.where(begin, jnp.diag(first_sd**2), before.covariance),
+        )
+        start = estimate.mean
+        (state, covariance), first_gain, first_whitening, first_density = self._update(
+            estimate, row.first, row.is_second * row.first_mask
+        )
+        points = jnp.concatenate([state[None], state[None] + self._offsets])
+        images = jax.vmap(lambda x: self._predict(x, row.action, row.dt))(points)
+        slope = (images[1:] - images[:1]).reshape(num, num).T / self._scale[None]
+        spread = covariance + jnp.diag(self._kick**2)
+        covariance = slope @ spread @ slope.T
+        covariance = 0.5 * (covariance + covariance.T)
+        estimate, last_gain, last_whitening, last_density = self._update(
+            Estimate(images[0], covariance), row.last, row.last_mask
+        )
+        gains = Gains(first_gain, last_gain, first_whitening, last_whitening)
+        return estimate, FilteredRow(gains, first_density + last_density, start)
+
+    def _update(self, estimate: Estimate, reading, mask):
         """One reading: new mean and covariance, gain, whitening, log-density."""
-        mask = mask.reshape(-1)
+        state, covariance = estimate
+        mask, num, variance = mask.reshape(-1), self._num, self._variance
         error = mask[:, None] * covariance * mask[None] + variance * mask[:, None]
         error = error + jnp.diag(1.0 - mask)
         factor = jnp.linalg.cholesky(error)
@@ -110,44 +163,33 @@ def extended_filter(
             jnp.where(diagonal > 0, jnp.log(jnp.where(diagonal > 0, diagonal, 1.0)), 0)
         ) - 0.5 * jnp.sum((whitening @ miss) ** 2)
         log_density = log_density - 0.5 * jnp.sum(mask) * jnp.log(2.0 * jnp.pi)
-        return state, covariance, gain, whitening, log_density
+        return Estimate(state, covariance), gain, whitening, log_density
+
+
+def extended_filter(
+    scene: Scene, params: Params, data: TrackData, noise: NoiseLevel
+) -> Filtered:
+    """Filter all rows at one hypothesis.
+
+    Args:
+        scene: the block's scene.
+        params: the hypothesis.
+        data: the block's readings.
+        noise: of readings and motion.
+
+    Returns:
+        Gains, and the log-density of all readings but the first of each track, each
+        row's as often as the row counts.
+    """
+    row_filter = RowFilter(scene, params, data.steps.dt, noise)
 
     def advance(carry, row):
-        state, covariance, total = carry
-        is_start, is_second, start, first, first_mask, action, last, last_mask, dt = row
-        first_covariance = jnp.diag(
-            jnp.where(first_mask.reshape(-1) > 0, scale, unknown) ** 2
-        )
-        state = jnp.where(is_start > 0, start, state)
-        covariance = jnp.where(is_start > 0, first_covariance, covariance)
-        state, covariance, first_gain, first_whitening, density = update(
-            state, covariance, first, is_second * first_mask
-        )
-        total = total + density
-        points = jnp.concatenate([state[None], state[None] + offsets])
-        images = jax.vmap(lambda x: predict(x, action, dt))(points)
-        state = images[0]
-        slope = (images[1:] - images[:1]).reshape(num, num).T / scale[None]
-        spread = covariance + jnp.diag(kick**2)
-        covariance = slope @ spread @ slope.T
-        covariance = 0.5 * (covariance + covariance.T)
-        state, covariance, last_gain, last_whitening, density = update(
-            state, covariance, last, last_mask
-        )
-        gains = Gains(first_gain, last_gain, first_whitening, last_whitening)
-        return (state, covariance, total + density), gains
+        estimate, total = carry
+        estimate, found = row_filter(estimate, row)
+        density = found.log_likelihood
+        density = density if row.weight is None else row.weight * density
+        return (estimate, total + density), (found.gains, found.start, estimate)
 
-    rows = (
-        data.is_start,
-        data.is_second,
-        data.start,
-        steps.state,
-        data.first_mask,
-        steps.action,
-        steps.next_state,
-        data.last_mask,
-        steps.dt if steps.dt.ndim else None,
-    )
-    carry = (jnp.zeros((num_bodies, 6)), jnp.eye(num), jnp.zeros(()))
-    (_, _, total), gains = jax.lax.scan(advance, carry, rows)
-    return Filtered(gains, total)
+    carry = (row_filter.start(), jnp.zeros(()))
+    (_, total), (gains, starts, after) = jax.lax.scan(advance, carry, data.rows)
+    return Filtered(gains, total, starts, after)

@@ -134,7 +134,7 @@ class NoiseProposal(NamedTuple):
 
 
 def _other_starts(vector: np.ndarray) -> np.ndarray:
-    """Noise of velocity, of spin, or of both handed to the motion, `[way, group, n]`."""
+    """Velocity noise, spin noise or both handed to the motion, `[way, group, n]`."""
     starts = []
     for channels in ((0,), (1,), (0, 1)):
         moved = vector.reshape(len(vector), -1, NUM_EACH).copy()

@@ -77,6 +77,18 @@ class Particles(NamedTuple):
     """Log-density of the target itself."""
 
 
+class Tempered(NamedTuple):
+    """Where tempering ended."""
+
+    particles: Particles
+    log_whole: np.ndarray
+    """Log-estimate of the sum over structures of prior times evidence by each island,
+    `[object, island]`."""
+    counts: MoveCounts
+    power: np.ndarray
+    """Of the target that was reached, `[object]`; 1 unless it takes too many steps."""
+
+
 def sample_tempered(
     key: Key,
     targets: StructureTarget,
@@ -103,39 +115,11 @@ def sample_tempered(
     mixtures = start_mixtures(targets, modes)
     size = settings.num_importance
     mixtures, found = adapt_mixtures(rng, targets, mixtures, size, evaluate)
-    mixtures = _spread(targets, mixtures)
     num_particles = -(-settings.num_chains * settings.num_samples // _NUM_ISLANDS)
-    particles = _start(rng, targets, mixtures, num_particles * _NUM_ISLANDS, evaluate)
+    particles, log_whole, counts, power = temper(
+        rng, targets, mixtures, num_particles * _NUM_ISLANDS, evaluate
+    )
     num_objects, num_structures = targets.structures.shape[:2]
-    power = np.zeros(num_objects)
-    log_whole = np.zeros((num_objects, _NUM_ISLANDS))
-    counts, step_size = no_moves(num_objects), np.full(num_objects, _WALK_STEP)
-    for _ in range(_MAX_STEPS):
-        log_ratio = _log_ratio(particles)
-        step = np.array(
-            [
-                next_step(r, 1.0 - b, _KEPT_SHARE)
-                for r, b in zip(log_ratio, power, strict=True)
-            ]
-        )
-        log_weight = times(step[:, None], log_ratio)
-        by_island = log_weight.reshape(num_objects, _NUM_ISLANDS, num_particles)
-        log_whole += np.logaddexp.reduce(by_island, axis=-1) - np.log(num_particles)
-        power = np.where(step >= 1.0 - power, 1.0, power + step)
-        rows = _resample(rng, by_island)
-        particles = _take(particles, rows, power)
-        is_last = bool(np.all(power >= 1.0))
-        for move in _CYCLE * (_LAST_CYCLES if is_last else 1):
-            particles, info = _move(
-                move, rng, particles, targets, mixtures, power, step_size, evaluate
-            )
-            count_moves(counts, move, info)
-            if move == "walk":
-                rate = np.mean(np.asarray(info.accept_probability, float), axis=1)
-                step_size = step_size * np.exp(rate - _WALK_ACCEPT)
-                step_size = np.clip(step_size, 0.02, 0.98)
-        if is_last:
-            break
     structure = np.asarray(particles.points.structure)
     structure = structure.reshape(num_objects, _NUM_ISLANDS, num_particles)
     with np.errstate(divide="ignore"):
@@ -165,6 +149,58 @@ def sample_tempered(
         evidence=evidence,
         diagnostics=verdicts,
     )
+
+
+def temper(
+    rng: np.random.Generator,
+    targets: StructureTarget,
+    mixtures: LaplaceMixture,
+    num_particles: int,
+    evaluate: Callable[..., Array] = evaluate_each,
+) -> Tempered:
+    """Take draws of mixtures to the posteriors.
+
+    Args:
+        rng: source of randomness.
+        targets: stacked along a leading object axis.
+        mixtures: one of each object; half of the particles start evenly spread over
+            structures.
+        num_particles: of each object, a multiple of the 16 islands.
+        evaluate: as in `sample_tempered`.
+    """
+    mixtures = _spread(targets, mixtures)
+    particles = _start(rng, targets, mixtures, num_particles, evaluate)
+    num_objects, num_each = targets.structures.shape[0], num_particles // _NUM_ISLANDS
+    power = np.zeros(num_objects)
+    log_whole = np.zeros((num_objects, _NUM_ISLANDS))
+    counts, step_size = no_moves(num_objects), np.full(num_objects, _WALK_STEP)
+    for _ in range(_MAX_STEPS):
+        log_ratio = _log_ratio(particles)
+        step = np.array(
+            [
+                next_step(r, 1.0 - b, _KEPT_SHARE)
+                for r, b in zip(log_ratio, power, strict=True)
+            ]
+        )
+        log_weight = times(step[:, None], log_ratio)
+        by_island = log_weight.reshape(num_objects, _NUM_ISLANDS, num_each)
+        log_whole += np.logaddexp.reduce(by_island, axis=-1) - np.log(num_each)
+        power = np.where(step >= 1.0 - power, 1.0, power + step)
+        rows = _resample(rng, by_island)
+        particles = _take(particles, rows, power)
+        is_last = bool(np.all(power >= 1.0))
+        for move in _CYCLE * (_LAST_CYCLES if is_last else 1):
+            particles, info = _move(
+                move, rng, particles, targets, mixtures, power, step_size, evaluate
+            )
+            count_moves(counts, move, info)
+            if move == "walk":
+                rate = np.mean(np.asarray(info.accept_probability, float), axis=1)
+                step_size = step_size * np.exp(rate - _WALK_ACCEPT)
+                step_size = np.clip(step_size, 0.02, 0.98)
+        if is_last:
+            break
+    return Tempered(particles, log_whole, counts, power)
 
 
 @QuickCompile

@@ -1,5 +1,7 @@
 """Readings in the order in which a filter takes them: start, second reading, next."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
@@ -7,6 +9,22 @@ from jaxtyping import Array, Float
 from boomdp_jax.core.arrays import on_device
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.one_step import Readings, readings
+
+
+class TrackRow(NamedTuple):
+    """One row of a `TrackData`, or all of them with a leading time axis."""
+
+    is_start: Float[Array, "*time"]
+    is_second: Float[Array, "*time"]
+    start: Float[Array, "*time body 6"]
+    first: Float[Array, "*time body 6"]
+    first_mask: Float[Array, "*time body 6"]
+    action: Float[Array, "*time body 3"]
+    last: Float[Array, "*time body 6"]
+    last_mask: Float[Array, "*time body 6"]
+    dt: Float[Array, "*time"] | None
+    """None where all steps are equally long."""
+    weight: Float[Array, "*time"] | None
 
 
 class TrackData(eqx.Module):
@@ -28,6 +46,24 @@ class TrackData(eqx.Module):
     """One where the first reading is a second one of an instant already read."""
     start: Float[Array, "time body 6"]
     """Where a track would start in each row: readings, or a guess where missing."""
+    weight: Float[Array, " time"] | None = None
+    """As how many times its likelihood each row counts; None: as one."""
+
+    @property
+    def rows(self) -> TrackRow:
+        """All rows, to be scanned over."""
+        return TrackRow(
+            is_start=self.is_start,
+            is_second=self.is_second,
+            start=self.start,
+            first=self.steps.state,
+            first_mask=self.first_mask,
+            action=self.steps.action,
+            last=self.steps.next_state,
+            last_mask=self.last_mask,
+            dt=self.steps.dt if self.steps.dt.ndim else None,
+            weight=self.weight,
+        )
 
 
 def track_data(

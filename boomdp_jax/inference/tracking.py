@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar, on_device
-from boomdp_jax.inference.track_data import TrackData
+from boomdp_jax.inference.track_data import TrackData, TrackRow
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import state_from_array
@@ -56,12 +56,17 @@ class Gains(eqx.Module):
         return (diagonal > 0).astype(both.dtype)
 
     @property
-    def log_volume(self) -> Float[Array, "*batch"]:
-        """Log-determinant of all whitenings."""
+    def log_volumes(self) -> Float[Array, "*batch time"]:
+        """Log-determinant of the whitenings of each row."""
         both = jnp.stack([self.first_whitening, self.last_whitening], axis=-3)
         diagonal = jnp.diagonal(both, axis1=-2, axis2=-1)
         logs = jnp.log(jnp.where(diagonal > 0, diagonal, 1.0))
-        return jnp.sum(logs, axis=(-3, -2, -1))
+        return jnp.sum(logs, axis=(-2, -1))
+
+    @property
+    def log_volume(self) -> Float[Array, "*batch"]:
+        """Log-determinant of all whitenings."""
+        return jnp.sum(self.log_volumes, axis=-1)
 
 
 def one_step_gains(data: TrackData, scale: np.ndarray) -> Gains:
@@ -140,39 +145,44 @@ def innovations(
         Of the reading that a row starts from and of the one that it ends at;
         independent and of unit variance if hypothesis, gains and noise are right.
     """
-    steps = data.steps
-    shape = steps.state.shape[1:]
-    predict = predictor(scene, params, steps.dt)
+    predict = predictor(scene, params, data.steps.dt)
+
+    def advance(state, inputs):
+        return track_row(predict, state, *inputs)
+
+    start = jnp.zeros(data.steps.state.shape[1:])
+    return jax.lax.scan(advance, start, (data.rows, gains))[1]
+
+
+def track_row(
+    predict: Predict, state: Float[Array, "body 6"], row: TrackRow, gains: Gains
+) -> tuple[Float[Array, "body 6"], Float[Array, "2 body 6"]]:
+    """Take a state through one row.
+
+    Args:
+        predict: one step of a hypothesis.
+        state: best guess before the row.
+        row: its readings.
+        gains: for the row.
+
+    Returns:
+        The best guess after it, and the whitened innovations of its two readings.
+    """
 
     def correct(state, reading, mask, gain, whitening):
         error = mask * channel_difference(reading, state)
         moved = state + _apply(gain, error)
         return moved, _apply(whitening, error, is_lower=True)
 
-    def advance(state, row):
-        is_start, start, first, first_mask, action, last, last_mask, dt, gain = row
-        state = jnp.where(is_start > 0, start, state)
-        state, first_error = correct(
-            state, first, first_mask, gain.first, gain.first_whitening
-        )
-        state = predict(state, action, dt)
-        state, last_error = correct(
-            state, last, last_mask, gain.last, gain.last_whitening
-        )
-        return state, jnp.stack([first_error, last_error])
-
-    rows = (
-        data.is_start,
-        data.start,
-        steps.state,
-        data.first_mask,
-        steps.action,
-        steps.next_state,
-        data.last_mask,
-        steps.dt if steps.dt.ndim else None,
-        gains,
+    state = jnp.where(row.is_start > 0, row.start, state)
+    state, first_error = correct(
+        state, row.first, row.first_mask, gains.first, gains.first_whitening
     )
-    return jax.lax.scan(advance, jnp.zeros(shape), rows)[1]
+    state = predict(state, row.action, row.dt)
+    state, last_error = correct(
+        state, row.last, row.last_mask, gains.last, gains.last_whitening
+    )
+    return state, jnp.stack([first_error, last_error])
 
 
 def _apply(matrix, vector: Float[Array, "body 6"], *, is_lower: bool = False):

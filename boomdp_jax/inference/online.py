@@ -1,0 +1,379 @@
+r"""A belief that takes one transition at a time: particles over structures and numbers.
+
+`step` is one compiled function over a table of fixed capacity (`online_step`): every
+particle's filter takes the new readings in, weights change, and where few particles are
+left in effect they are resampled and moved. It never recompiles and needs no more time
+the longer the history is. `refit`, which takes seconds, fits the scene anew
+(`online_refit`); `observe` is a step, and a refit when the belief asks for one.
+
+Prefer `infer` where all data are there; this where they come one by one and something
+has to be decided in between. Chopin (2002), A sequential particle filter method for
+static models; Gilks and Berzuini (2001), Following a moving target.
+"""
+
+import functools
+import time
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from boomdp_jax.core.arrays import BoolScalar, Key, on_device
+from boomdp_jax.core.history import History, make_history
+from boomdp_jax.inference.compile_ahead import signature
+from boomdp_jax.inference.components import independent_blocks
+from boomdp_jax.inference.infer import check_history
+from boomdp_jax.inference.online_posterior import online_posterior
+from boomdp_jax.inference.online_refit import (
+    BlockRefit,
+    RefitSettings,
+    make_online_block,
+    prior_belief,
+    refit_block,
+)
+from boomdp_jax.inference.online_refresh import LEAVING_SHARE, OnlineInfo, refresh
+from boomdp_jax.inference.online_state import BeliefState, BlockBelief
+from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.physics.scene_spec import SceneSpec
+from boomdp_jax.physics.state import State
+
+# First refit, in transitions; then whenever this share of those fitted has come anew.
+# Gains are those of the last fit: when the table had nearly doubled since, quantiles of
+# a pinned box's mass were a standard deviation off those of a fit of all rows.
+_FIRST_REFIT, _GROWN = 8, 0.5
+# A refit for lack of particles in effect comes no sooner than so many transitions after
+# the last, and after this share of the table has been renewed.
+_REST, _RENEWED = 4, 0.25
+_MULTIPLE = 16
+
+
+class RefitInfo(NamedTuple):
+    """What a refit found, on the host."""
+
+    blocks: tuple[BlockRefit, ...]
+    seconds: float
+
+    @property
+    def has_changed(self) -> bool:
+        """Whether some block's world was found to have changed."""
+        return any(block.changed_at is not None for block in self.blocks)
+
+
+class Observed(NamedTuple):
+    """What became of one transition."""
+
+    step: OnlineInfo
+    refit: RefitInfo | None
+
+
+class OnlineBelief:
+    r"""Settings and compiled functions of an online belief about one scene.
+
+    Bodies that are or may be tied form a block; blocks are independent and each has its
+    particles. Which pairs may be tied follows from the scene alone, so that a tie can
+    turn up late, unless `screen` says which pairs have been seen to move apart.
+
+    With `forgetting` $\lambda < 1$ the likelihood of a row that is n rows old counts to
+    the power $\lambda^n$: the belief rests on the last $1 / (1 - \lambda)$ rows or so,
+    and drifts back to the prior where nothing new is learnt. (The prior itself is not
+    forgotten.)
+    """
+
+    def __init__(
+        self,
+        spec: SceneSpec,
+        *,
+        capacity: int = 256,
+        num_particles: int = 1024,
+        forgetting: float = 1.0,
+        dt: float | None = None,
+        has_varying_dt: bool = False,
+        change_rate: float = 1.0 / 256.0,
+        screen: History | None = None,
+    ):
+        """Set up.
+
+        Args:
+            spec: the scene: outlines, what is known, what may exist.
+            capacity: transitions that are remembered. When the table is full the oldest
+                eighth of it leaves at once, and with it what it told.
+            num_particles: of each block, a multiple of 16.
+            forgetting: factor per transition on the weight of all before, in (0, 1].
+            dt: length of every step [s]; default: the scene's.
+            has_varying_dt: whether `step` is told each step's length instead, which
+                costs a little more.
+            change_rate: prior probability per transition that the world changes, for
+                the test that a surprise leads to.
+            screen: readings of all bodies; pairs that they show to move apart are
+                never tied (see `independent_blocks`).
+
+        Raises:
+            ValueError: a number out of range; a scene that `infer` refuses.
+        """
+        if capacity < LEAVING_SHARE:
+            raise ValueError(
+                f"capacity: expected at least {LEAVING_SHARE}, got {capacity}"
+            )
+        if num_particles < _MULTIPLE or num_particles % _MULTIPLE:
+            raise ValueError(
+                f"num_particles: expected a multiple of {_MULTIPLE}, got "
+                f"{num_particles}"
+            )
+        if not 0.0 < forgetting <= 1.0:
+            raise ValueError(f"forgetting: expected in (0, 1], got {forgetting}")
+        if not 0.0 < change_rate < 1.0:
+            raise ValueError(f"change_rate: expected in (0, 1), got {change_rate}")
+        if dt is not None and not (np.isfinite(dt) and dt > 0):
+            raise ValueError(f"dt: expected positive seconds, got {dt}")
+        self.spec, self.capacity = spec, capacity
+        self._dt = float(spec.dt if dt is None else dt)
+        self._settings = RefitSettings(
+            spec=spec,
+            num_particles=num_particles,
+            is_uniform=not has_varying_dt,
+            forgetting=float(forgetting),
+            change_rate=float(change_rate),
+        )
+        empty = np.zeros((0, spec.num_bodies, 6))
+        history = make_history(
+            empty, empty[..., :3], empty, self._dt, capacity=capacity
+        )
+        self._empty = eqx.tree_at(
+            lambda h: h.dt, history, on_device(np.full(capacity, self._dt))
+        )
+        check_history(spec, self._empty if screen is None else screen)
+        self._blocks = [
+            make_online_block(self._settings, bodies, self._empty)
+            for bodies in independent_blocks(
+                spec, self._empty if screen is None else screen
+            )[0]
+        ]
+        groups: dict[object, list[int]] = {}
+        for index, block in enumerate(self._blocks):
+            groups.setdefault(signature(block.target), []).append(index)
+        self._groups = list(groups.values())
+        self._step = jax.jit(
+            functools.partial(
+                refresh,
+                tuple(
+                    tuple(self._blocks[index].bodies for index in group)
+                    for group in self._groups
+                ),
+                self._settings.forgetting,
+            )
+        )
+
+    @property
+    def blocks(self) -> list[tuple[str, ...]]:
+        """Names of the bodies of each block, in the order in which infos list them."""
+        return [
+            tuple(self.spec.names[body] for body in self._blocks[index].bodies)
+            for group in self._groups
+            for index in group
+        ]
+
+    def init(self, key: Key, history: History | None = None) -> BeliefState:
+        """Begin with the prior, or with what a history says.
+
+        Args:
+            key: random key; all that follows is decided by it and the transitions.
+            history: transitions to begin with, which are fitted at once (seconds).
+
+        Returns:
+            The belief, a pytree of arrays.
+
+        Raises:
+            ValueError: a history of another number of bodies, of more transitions than
+                the capacity, or of steps of another length.
+        """
+        key, prior_key = jax.random.split(key)
+        beliefs = {
+            index: prior_belief(
+                jax.random.fold_in(prior_key, index), self._settings, block
+            )
+            for index, block in enumerate(self._blocks)
+        }
+        integer = jnp.zeros((), int).dtype
+        state = BeliefState(
+            key=key,
+            history=self._empty,
+            num_rows=on_device(0, integer),
+            num_seen=on_device(0, integer),
+            refit_at=on_device(_FIRST_REFIT, integer),
+            refit_after=on_device(_REST, integer),
+            blocks=self._stacked(beliefs),
+        )
+        if history is None:
+            return state
+        table = self._checked(history)
+        num_rows = int(table.num_transitions)
+        if num_rows == 0:
+            return state
+        state = eqx.tree_at(
+            lambda s: (s.history, s.num_rows, s.num_seen),
+            state,
+            (table, on_device(num_rows, integer), on_device(num_rows, integer)),
+        )
+        return self.refit(state)[0]
+
+    def step(
+        self,
+        belief: BeliefState,
+        state: State,
+        wrench: Float[Array, "body 3"],
+        next_state: State,
+        dt: Float[Array, ""] | float | None = None,
+        *,
+        starts_episode: BoolScalar | bool = False,
+    ) -> tuple[BeliefState, OnlineInfo]:
+        """Take one transition in: a pure function that compiles once.
+
+        It can be called under `jit` and scanned. The end of the last transition and the
+        start of this one are one reading where they are equal to the bit, otherwise two
+        readings of the same instant.
+
+        Args:
+            belief: so far.
+            state: reading before the step; NaN marks what is missing.
+            wrench: at the centres of mass, held over the step [N, N, N m]. If it is not
+                finite, the transition tells nothing; info says so.
+            next_state: reading after the step, NaN where missing.
+            dt: length of the step [s], if lengths vary.
+            starts_episode: whether bodies were moved otherwise since the last
+                transition.
+
+        Returns:
+            The belief, and what happened.
+
+        Raises:
+            ValueError: a step length where all are equal, or none where they vary.
+        """
+        if (dt is None) != self._settings.is_uniform:
+            expected = "none" if self._settings.is_uniform else "seconds"
+            raise ValueError(
+                f"dt: expected {expected}, with has_varying_dt="
+                f"{not self._settings.is_uniform}; got {dt}"
+            )
+        length = jnp.asarray(self._dt if dt is None else dt, float)
+        begins = jnp.asarray(starts_episode, bool)
+        return self._step(
+            belief, state.array, jnp.asarray(wrench), next_state.array, length, begins
+        )
+
+    def observe(
+        self,
+        belief: BeliefState,
+        state: State,
+        wrench: Float[Array, "body 3"],
+        next_state: State,
+        dt: Float[Array, ""] | float | None = None,
+        *,
+        starts_episode: bool = False,
+    ) -> tuple[BeliefState, Observed]:
+        """A step, and a refit where the step asks for one; arguments as for `step`."""
+        belief, info = self.step(
+            belief, state, wrench, next_state, dt, starts_episode=starts_episode
+        )
+        if not bool(info.needs_refit):
+            return belief, Observed(info, None)
+        belief, refit = self.refit(belief)
+        return belief, Observed(info, refit)
+
+    def refit(self, belief: BeliefState) -> tuple[BeliefState, RefitInfo]:
+        """Fit every block anew to the table; takes seconds, not for `jit`.
+
+        Where a block's readings have looked odd since some row, and its world is found
+        to have changed then, its rows before that are left out from now on.
+
+        Args:
+            belief: so far.
+
+        Returns:
+            The belief with fresh particles, mixtures and gains; what was found.
+        """
+        start = time.perf_counter()
+        key, refit_key = jax.random.split(belief.key)
+        num_rows = int(belief.num_rows)
+        beliefs: dict[int, BlockBelief] = {}
+        found = []
+        for group, stacked in zip(self._groups, belief.blocks, strict=True):
+            for place, index in enumerate(group):
+                old = jax.tree.map(lambda leaf, i=place: leaf[i], stacked)
+                beliefs[index], info = refit_block(
+                    jax.random.fold_in(refit_key, index),
+                    self._settings,
+                    old,
+                    self._blocks[index].bodies,
+                    belief.history,
+                    num_rows,
+                )
+                found.append(info)
+        latest = max((int(b.begin) for b in beliefs.values()), default=0)
+        integer = belief.num_seen.dtype
+        num_seen, used = int(belief.num_seen), num_rows - latest
+        wait = max(_FIRST_REFIT, int(_GROWN * used))
+        rest = max(_REST, int(_RENEWED * used))
+        belief = eqx.tree_at(
+            lambda s: (s.key, s.blocks, s.refit_at, s.refit_after),
+            belief,
+            (
+                key,
+                self._stacked(beliefs),
+                on_device(num_seen + wait, integer),
+                on_device(num_seen + rest, integer),
+            ),
+        )
+        return belief, RefitInfo(tuple(found), time.perf_counter() - start)
+
+    def posterior(self, belief: BeliefState) -> Posterior:
+        """The belief as weighted draws, as `infer` gives them.
+
+        With one block the draws are its particles with their weights; with several,
+        each block's particles are resampled and paired at random.
+        """
+        parts = [
+            (self._blocks[index], jax.tree.map(lambda leaf, i=place: leaf[i], stacked))
+            for group, stacked in zip(self._groups, belief.blocks, strict=True)
+            for place, index in enumerate(group)
+        ]
+        return online_posterior(jax.random.fold_in(belief.key, 1), self.spec, parts)
+
+    def _stacked(self, beliefs: dict[int, BlockBelief]) -> tuple[BlockBelief, ...]:
+        """Blocks of equal shapes side by side."""
+        return tuple(
+            jax.tree.map(
+                lambda *leaves: jax.device_put(
+                    np.stack([np.asarray(leaf) for leaf in leaves])
+                ),
+                *(beliefs[index] for index in group),
+            )
+            for group in self._groups
+        )
+
+    def _checked(self, history: History) -> History:
+        """A history's rows in a table of the belief's capacity."""
+        check_history(self.spec, history)
+        mask = np.asarray(history.mask)
+        num_rows = int(mask.sum())
+        if num_rows > self.capacity:
+            raise ValueError(
+                f"history: expected at most {self.capacity} transitions, the capacity; "
+                f"got {num_rows}"
+            )
+        dt = np.asarray(history.dt, float)[mask]
+        if self._settings.is_uniform and not np.allclose(dt, self._dt, rtol=1e-5):
+            raise ValueError(
+                f"history: expected steps of {self._dt} s, or has_varying_dt; got "
+                f"{dt[np.argmax(np.abs(dt - self._dt))]}"
+            )
+        rows = np.flatnonzero(mask)
+
+        def put(table: Array, leaf: Array) -> Array:
+            array = np.array(table)
+            array[:num_rows] = np.asarray(leaf)[rows]
+            return on_device(array, array.dtype)
+
+        return jax.tree.map(put, self._empty, history)

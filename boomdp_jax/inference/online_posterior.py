@@ -1,0 +1,105 @@
+"""An online belief as a `Posterior`: particles decoded, with noise drawn for each."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+
+from boomdp_jax.core.arrays import Key, on_device
+from boomdp_jax.inference.assemble import assemble_posterior
+from boomdp_jax.inference.block import Block
+from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics
+from boomdp_jax.inference.evidence_report import BlockResult
+from boomdp_jax.inference.noise import host_generator
+from boomdp_jax.inference.one_step import NOISE_SHAPE
+from boomdp_jax.inference.online_likelihood import log_likelihoods
+from boomdp_jax.inference.online_state import BlockBelief
+from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.resampling import systematic
+from boomdp_jax.inference.sample import BlockDraws
+from boomdp_jax.physics.scene_spec import SceneSpec
+
+# Fewer particles in effect than this share are reason for doubt.
+_LEAST_SHARE = 0.05
+
+
+def online_posterior(
+    key: Key, spec: SceneSpec, parts: list[tuple[Block, BlockBelief]]
+) -> Posterior:
+    """Put the particles of independent blocks side by side.
+
+    Args:
+        key: random key.
+        spec: the scene.
+        parts: its blocks, and what is believed of each.
+
+    Returns:
+        Draws; their weights are those of the particles where there is one block.
+    """
+    pair_key, assemble_key = jax.random.split(key)
+    rng = host_generator(pair_key)
+    results, log_weight = [], None
+    for block, belief in parts:
+        particles = belief.particles
+        weight = np.exp(np.asarray(particles.log_weight, float))
+        rows = np.arange(len(weight))
+        if len(parts) == 1:
+            log_weight = np.log(weight / weight.sum())
+        else:
+            rows = rng.permutation(systematic(rng, weight, len(weight)))
+        results.append(_result(rng, spec, block, belief, rows))
+    posterior = assemble_posterior(
+        assemble_key, spec, results, seconds={}, notes=[], method="online"
+    )
+    if log_weight is None:
+        return posterior
+    weights = on_device(log_weight, posterior.log_weight.dtype)
+    return dataclasses.replace(posterior, log_weight=weights)
+
+
+def _result(
+    rng: np.random.Generator,
+    spec: SceneSpec,
+    block: Block,
+    belief: BlockBelief,
+    rows: np.ndarray,
+) -> BlockResult:
+    """Chosen particles of a block, as a sampler would hand them over."""
+    target, particles, tally = belief.target, belief.particles, belief.tally
+    likelihood: Any = target.log_likelihood
+    structure, z = np.asarray(particles.structure), np.asarray(particles.z)
+    value = log_likelihoods(target, tally, particles.structure, particles.square)
+    prior = jax.vmap(target.log_prior_density)(particles.structure, particles.z)
+    log_density = np.asarray(value + prior, float)
+    reference = np.asarray(likelihood.reference, float)[structure]
+    scale = np.asarray(likelihood.coordinates.scales.noise, float)[None] / reference
+    num = np.asarray(tally.num, float)[structure]
+    rate = scale**2 + 0.5 * np.asarray(particles.square, float)
+    noise = reference * np.sqrt(rate / rng.gamma(NOISE_SHAPE + 0.5 * num))
+    # Fitted, one for a structure: between refits the noise of the motion stays.
+    impulse = np.asarray(belief.champions.noise.impulse)
+    weight = np.exp(np.asarray(particles.log_weight, float))
+    size = float(weight.sum() ** 2 / (weight**2).sum())
+    reasons = []
+    if size < _LEAST_SHARE * len(weight):
+        reasons.append(f"{size:.0f} of {len(weight)} particles are left in effect")
+    verdict = ChainDiagnostics(
+        ok=not reasons,
+        reasons=reasons,
+        r_hat={},
+        effective_sample_size={"weights": size},
+        acceptance={},
+    )
+    draws = BlockDraws(
+        structure=structure[rows][None],
+        z=z[rows][None],
+        log_density=log_density[rows][None],
+        noise_scale=noise[rows].astype(z.dtype)[None],
+        impulse_scale=impulse[structure[rows]][None],
+        log_evidence=np.array([np.nan]),
+        evidence=None,
+        diagnostics=[verdict],
+        chain_index=np.arange(1),
+    )
+    return BlockResult(block._replace(target=target), draws, 0)
