@@ -7,6 +7,7 @@ import numpy as np
 
 from boomdp_jax.core.history import make_history
 from boomdp_jax.inference.block import make_block, stack_blocks
+from boomdp_jax.inference.noise_level import NoiseFit, prior_noise
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
 from boomdp_jax.physics.state import state_from_array
@@ -89,6 +90,68 @@ def draw_objects(
     sd = np.sqrt(variance)[:, None, None, [0, 0, 1, 2, 2, 3]]
     noise = sd * rng.standard_normal(truth.shape)
     return PriorObjects(stacked(truth + noise), structure, z)
+
+
+class PriorTracks(NamedTuple):
+    """True hypotheses and noise, and the noisy tracks that they make."""
+
+    targets: StructureTarget
+    """Stacked along a leading object axis, with the one-step likelihood."""
+    structure: np.ndarray
+    """`[object]`."""
+    z: np.ndarray
+    """`[object, dim]`."""
+    noise: NoiseFit
+    """Of readings and motion, leading axis `object`."""
+
+
+def draw_tracks(
+    rng: np.random.Generator, num_objects: int, num_rows: int
+) -> PriorTracks:
+    """Draw hypotheses and noise from the prior, and one noisy track given each.
+
+    States are latent: a body starts somewhere, is kicked before each step and pushed
+    during it, and is read once an instant.
+    """
+    base = draw_objects(rng, num_objects, num_rows)
+    likelihood: Any = base.targets.log_likelihood
+    scale = np.asarray(likelihood.coordinates.scales.noise, float)[0]
+    reading, impulse = prior_noise(rng, scale, (num_objects, 1))
+    spec = box_scene()
+    mass = 30.0 * float(spec.scene.area[0])
+    shape = (num_objects, num_rows, 1)
+    wrench = rng.normal(size=(*shape, 3)) * _WRENCH * mass
+    kicks = impulse[:, None, :, [0, 0, 1]] * rng.standard_normal((*shape, 3))
+    start = rng.normal(size=(num_objects, 1, 6)) * _STATE
+    active = np.asarray(base.targets.structures[0])[base.structure]
+    dtype = base.targets.log_prior.dtype
+    z, *moved = (np.asarray(x, dtype) for x in (base.z, start, wrench, kicks))
+    after = np.asarray(_track_all(likelihood.coordinates, z, active, *moved), float)
+    truth = np.concatenate([start[:, None], after], axis=1)
+    sd = reading[:, None, :, [0, 0, 1, 2, 2, 3]]
+    read = truth + sd * rng.standard_normal(truth.shape)
+    blocks = [
+        make_block(spec, (0,), make_history(s[:-1], a, s[1:], DT))
+        for s, a in zip(read, wrench, strict=True)
+    ]
+    noise = NoiseFit(reading, impulse)
+    return PriorTracks(stack_blocks(blocks), base.structure, base.z, noise)
+
+
+@jax.jit
+def _track_all(coordinates, z, active, start, wrench, kicks):
+    def one_object(coordinates, z, active, start, wrenches, kicks):
+        params = coordinates(z, active)
+
+        def advance(now, row):
+            wrench, kick = row
+            kicked = now.at[:, 3:].add(kick)
+            now = step(coordinates.scene, params, state_from_array(kicked), wrench)[0]
+            return now.array, now.array
+
+        return jax.lax.scan(advance, start, (wrenches, kicks))[1]
+
+    return jax.vmap(one_object)(coordinates, z, active, start, wrench, kicks)
 
 
 @jax.jit

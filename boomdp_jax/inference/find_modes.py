@@ -22,10 +22,10 @@ from boomdp_jax.inference.fit import (
     join_fits,
     make_fits,
 )
-from boomdp_jax.inference.fit_noise import fit_noise, with_gains
+from boomdp_jax.inference.fit_noise import NoisePeaks, fit_noise, with_gains
 from boomdp_jax.inference.fit_starts import Guesses, first_fits, grown_fits
 from boomdp_jax.inference.noise import host_generator
-from boomdp_jax.inference.noise_level import NoiseFit
+from boomdp_jax.inference.noise_level import NUM_EACH, NoiseFit
 from boomdp_jax.inference.target import StructureTarget
 
 # Rounds of noise, gains and fit.
@@ -38,6 +38,8 @@ _START_NOISE = 3.0
 _MOST_FITTED = 8
 # So many nats below the best a structure is out of the question.
 _HOPELESS = 40.0
+# Sds by which gains take the motion's noise to be above its peak.
+_WIDENING = 1.0
 
 
 class Found(NamedTuple):
@@ -168,13 +170,24 @@ def _noise_of_structures(
     peaks = fit_noise(targets, top.take(rows), start.take(rows))
     vector = start.vector.reshape(num_objects, num_structures, -1)
     out = vector.reshape(len(top.z), -1).copy()
-    out[rows] = peaks.noise.vector
+    out[rows] = peaks.noise.vector + _widening(peaks)
     best = out[chosen[:, 0]]
     out = out.reshape(vector.shape)
     is_left = np.ones(evidence.shape, bool)
     is_left.reshape(-1)[rows] = False
     out = np.where(is_left[..., None], best[:, None], out)
     return NoiseFit.of_vector(out.reshape(len(top.z), -1))
+
+
+def _widening(peaks: NoisePeaks) -> np.ndarray:
+    """How far above its peak the motion's noise is taken, `[fit, number]`.
+
+    Fixed gains leave out that it is uncertain. Taken at its peak they give numbers too
+    little spread for a short recording, which weights could not make good later.
+    """
+    sd = np.sqrt(np.diagonal(np.linalg.inv(peaks.precision), axis1=1, axis2=2))
+    number = np.arange(sd.shape[1]) % NUM_EACH
+    return np.where(number >= 4, _WIDENING * sd, 0.0)
 
 
 def _laplace_evidence(targets: StructureTarget, top: Fits) -> np.ndarray:

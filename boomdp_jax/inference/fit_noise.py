@@ -51,7 +51,7 @@ def fit_noise(
     Returns:
         The noise of each.
     """
-    density = _Density(targets, fits)
+    density = NoiseDensity(targets, fits)
     x = start.vector.copy()
     value = np.full(len(x), -np.inf)
     precision = np.zeros((*x.shape, x.shape[1]))
@@ -77,7 +77,7 @@ def fit_noise(
     return NoisePeaks(NoiseFit.of_vector(x), precision, value)
 
 
-class _Density:
+class NoiseDensity:
     """Log-density of noise at the hypotheses of a list."""
 
     def __init__(self, targets: StructureTarget, fits: Fits):

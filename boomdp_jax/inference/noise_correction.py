@@ -165,6 +165,49 @@ def infer_noise(
     )
 
 
+def noise_about_peaks(
+    rng: np.random.Generator,
+    targets: StructureTarget,
+    start: NoiseFit,
+    structure: np.ndarray,
+    z: np.ndarray,
+    log_density: np.ndarray,
+    *,
+    is_drawn: bool,
+) -> NoiseFit:
+    """Noise for draws that are approximate themselves, not weighed by anything.
+
+    Args:
+        rng: source of randomness.
+        targets: stacked along a leading object axis.
+        start: noise of every structure of every object, in order.
+        structure: of each draw, `[object, draw]`.
+        z: coordinates of each.
+        log_density: of each, under the targets.
+        is_drawn: whether noise is drawn, or the most probable one of each structure.
+
+    Returns:
+        Noise with leading axis `object * draw`.
+    """
+    index = np.repeat(np.arange(len(structure)), structure.shape[1])
+    flat = z.reshape(len(index), -1).astype(float)
+    value = log_density.reshape(-1).astype(float)
+    fits = Fits(index, structure.reshape(-1), flat, value, np.zeros((len(index), 0, 0)))
+    proposal, group = _fit_proposal(rng, targets, fits, start)
+    if not is_drawn:
+        return NoiseFit.of_vector(proposal.center[group, 0])
+    return NoiseFit.of_vector(proposal.sample(rng, group))
+
+
+def _fit_proposal(
+    rng: np.random.Generator, targets: StructureTarget, draws: Fits, start: NoiseFit
+) -> tuple[NoiseProposal, np.ndarray]:
+    """Proposals for the structures that draws have, and the group of each draw."""
+    name = draws.index * targets.structures.shape[1] + draws.structure
+    names, group = np.unique(name, return_inverse=True)
+    return NoiseProposal.fit(rng, targets, draws, group, start.take(names)), group
+
+
 class _Problem:
     """Densities and moves of a list of draws."""
 
@@ -178,16 +221,11 @@ class _Problem:
 
     def start(self, rng, start: NoiseFit, structure, z, log_density) -> _Draws:
         """Draws with noise from the proposals, which are fitted first."""
-        num_structures = self._targets.structures.shape[1]
         structure = structure.reshape(-1)
         z = z.reshape(len(structure), -1).astype(float)
         value = log_density.reshape(-1).astype(float)
-        name = self._index * num_structures + structure
-        names, group = np.unique(name, return_inverse=True)
         fits = Fits(self._index, structure, z, value, np.zeros((len(z), 0, 0)))
-        self._proposal = NoiseProposal.fit(
-            self._targets, fits, group, start.take(names)
-        )
+        self._proposal, group = _fit_proposal(rng, self._targets, fits, start)
         vector = self._proposal.sample(rng, group)
         first = value + self._proposal.log_density(vector, group)
         last = self._log_last(structure, z, vector)

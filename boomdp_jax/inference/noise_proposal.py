@@ -3,7 +3,9 @@
 What a reading scatters by, noise of readings or of the motion may explain, and often
 each of them could: the peak with the one is not the only one. Fits therefore start
 anew where what a peak says is noise of velocity or spin readings is noise of the
-motion, and each peak is covered by a narrow component and by a wide one.
+motion, and each peak is covered by a narrow component and by a wide one. Of short
+recordings the density is far from normal: draws are weighed a few times over, and a
+component takes their mean and spread (adaptive importance sampling, Cappé et al. 2008).
 """
 
 import math
@@ -12,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from boomdp_jax.inference.fit import Fits
-from boomdp_jax.inference.fit_noise import NoisePeaks, fit_noise
+from boomdp_jax.inference.fit_noise import NoiseDensity, NoisePeaks, fit_noise
 from boomdp_jax.inference.noise_level import NUM_EACH, NoiseFit
 from boomdp_jax.inference.target import StructureTarget
 
@@ -23,6 +25,10 @@ _WIDTHS, _SHARES = np.array([1.1, 2.5]), np.array([0.75, 0.25])
 _NUM_ITERATIONS = 8
 # Readings' noise of a start where the motion's takes over, by the peak's.
 _LEFT_TO_READINGS = 0.2
+# Rounds of weighing, draws of each, and share of the component that they fit. Its
+# spread is a little widened, and above this share of the narrow component's variance.
+_NUM_ROUNDS, _NUM_DRAWS, _FITTED_SHARE = 3, 256, 0.6
+_WIDER, _LEAST_SPREAD = 1.3, 0.3
 # Least share of a peak, and distance at which two are one, in logarithms.
 _LEAST_SHARE, _SAME = 0.1, 0.5
 
@@ -43,11 +49,17 @@ class NoiseProposal(NamedTuple):
 
     @classmethod
     def fit(
-        cls, targets: StructureTarget, draws: Fits, group: np.ndarray, start: NoiseFit
+        cls,
+        rng: np.random.Generator,
+        targets: StructureTarget,
+        draws: Fits,
+        group: np.ndarray,
+        start: NoiseFit,
     ) -> "NoiseProposal":
         """Fit the noise at the best draw of every group.
 
         Args:
+            rng: source of randomness.
             targets: stacked along a leading object axis.
             draws: with their log-densities.
             group: of each draw.
@@ -65,7 +77,50 @@ class NoiseProposal(NamedTuple):
             NoiseFit.of_vector(starts.reshape(len(rows), -1)),
             _NUM_ITERATIONS,
         )
-        return cls.of_peaks(first, others)
+        proposal = peaks = cls.of_peaks(first, others)
+        density = NoiseDensity(targets, best)
+        names = np.arange(num_groups)
+        for _ in range(_NUM_ROUNDS):
+            each = np.repeat(names, _NUM_DRAWS)
+            vector = proposal.sample(rng, each)
+            log_weight = -proposal.log_density(vector, each)
+            vector = vector.reshape(num_groups, _NUM_DRAWS, -1)
+            log_weight = log_weight.reshape(num_groups, -1) + density(names, vector)
+            proposal = peaks.with_fitted(vector, log_weight)
+        return proposal
+
+    def with_fitted(
+        self, vector: np.ndarray, log_weight: np.ndarray
+    ) -> "NoiseProposal":
+        """With one component more, fitted to weighed draws of each group.
+
+        Args:
+            vector: `[group, draw, number]`.
+            log_weight: `[group, draw]`.
+        """
+        log_weight = np.where(np.isfinite(log_weight), log_weight, -np.inf)
+        top = log_weight.max(axis=1, keepdims=True)
+        weight = np.exp(log_weight - np.where(np.isfinite(top), top, 0.0))
+        weight = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)
+        mean = np.einsum("gn,gni->gi", weight, vector)
+        offset = vector - mean[:, None]
+        spread = np.einsum("gn,gni,gnj->gij", weight, offset, offset)
+        narrow = self.lower[:, 0]
+        least = np.linalg.inv(narrow @ np.swapaxes(narrow, 1, 2))
+        spread = _WIDER * spread + _LEAST_SPREAD * least
+        lower = np.linalg.cholesky(np.linalg.inv(spread))
+        is_found = np.isfinite(top[:, 0])
+        share = np.where(is_found, _FITTED_SHARE, 0.0)[:, None]
+        with np.errstate(divide="ignore"):
+            log_share = np.concatenate(
+                [np.log1p(-share) + self.log_share, np.log(share)], axis=1
+            )
+        center = np.where(is_found[:, None], mean, self.center[:, 0])
+        return NoiseProposal(
+            log_share,
+            np.concatenate([self.center, center[:, None]], axis=1),
+            np.concatenate([self.lower, lower[:, None]], axis=1),
+        )
 
     @classmethod
     def of_peaks(cls, first: NoisePeaks, others: NoisePeaks) -> "NoiseProposal":

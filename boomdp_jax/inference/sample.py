@@ -17,7 +17,7 @@ from boomdp_jax.inference.find_modes import Found, find_modes
 from boomdp_jax.inference.fit import Modes
 from boomdp_jax.inference.laplace_draws import best_hypothesis, sample_laplace
 from boomdp_jax.inference.noise import host_generator
-from boomdp_jax.inference.noise_correction import infer_noise
+from boomdp_jax.inference.noise_correction import infer_noise, noise_about_peaks
 from boomdp_jax.inference.noise_level import NoiseFit
 from boomdp_jax.inference.population import Population, sample_population
 from boomdp_jax.inference.structure_chain import ChainDraws
@@ -102,8 +102,10 @@ def sample_blocks(
     drawn = draw(draw_key, targets, found.modes, settings, evaluate_each)
     report("inferring the noise")
     rng = host_generator(noise_key)
-    if method == "map":
-        return _with_fitted_noise(targets, found.noise, drawn)
+    if method in ("laplace", "map"):
+        return _with_noise_about_peaks(
+            rng, targets, found.noise, drawn, is_drawn=method == "laplace"
+        )
     corrected = infer_noise(
         rng,
         targets,
@@ -137,19 +139,27 @@ def _with_reasons(verdict: ChainDiagnostics, reasons: list[str]) -> ChainDiagnos
     return verdict._replace(ok=not reasons, reasons=reasons)
 
 
-def _with_fitted_noise(
-    targets: StructureTarget, noise: NoiseFit, drawn: StructureDraws
+def _with_noise_about_peaks(
+    rng: np.random.Generator,
+    targets: StructureTarget,
+    noise: NoiseFit,
+    drawn: StructureDraws,
+    *,
+    is_drawn: bool,
 ) -> BlockDraws:
-    """Draws with the noise that their structures were fitted with."""
-    num_objects, num_structures = targets.structures.shape[:2]
-    structure = drawn.structure.reshape(num_objects, -1)
-    own = noise.take(np.arange(num_objects)[:, None] * num_structures + structure)
+    """Draws of an approximate method with noise that is no better."""
+    structure = drawn.structure.reshape(len(drawn.structure), -1)
+    z = drawn.z.reshape(*structure.shape, -1)
+    log_density = drawn.log_density.reshape(structure.shape)
+    own = noise_about_peaks(
+        rng, targets, noise, structure, z, log_density, is_drawn=is_drawn
+    )
     return BlockDraws(
         structure=structure,
-        z=drawn.z.reshape(*structure.shape, -1),
-        log_density=drawn.log_density.reshape(structure.shape),
-        noise_scale=own.reading,
-        impulse_scale=own.impulse,
+        z=z,
+        log_density=log_density,
+        noise_scale=own.reading.reshape(*structure.shape, -1, 4),
+        impulse_scale=own.impulse.reshape(*structure.shape, -1, 2),
         log_evidence=drawn.evidence.total,
         evidence=drawn.evidence,
         diagnostics=drawn.diagnostics,

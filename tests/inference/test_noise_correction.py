@@ -38,7 +38,7 @@ def reference():
 
     By importance sampling from a t that is fitted a few times over.
     """
-    history = free_box(np.random.default_rng(11), 15, noise=3.0 * NOISE)
+    history = free_box(np.random.default_rng(11), 30, noise=3.0 * NOISE)
     joint = joint_normal(history)
     middle = np.log(0.1 * SCALE[2:])
 
@@ -91,10 +91,10 @@ def test_mass_noise_and_evidence_are_those_of_the_joint_density(reference, metho
         axis=1,
     )
     offset, ratio = (found.mean(0) - mean) / sd, found.std(0) / sd
+    # Of thirty readings noise has a long tail, to which few draws go.
     assert abs(offset[0]) < 0.15
-    assert abs(ratio[0] - 1.0) < 0.12
-    # Of so few readings noise has a long tail, to which few draws go.
-    np.testing.assert_array_less(np.abs(offset[1:]), 0.4)
-    np.testing.assert_allclose(ratio[1:], 1.0, atol=0.45)
+    assert abs(ratio[0] - 1.0) < 0.15
+    np.testing.assert_array_less(np.abs(offset[1:]), 0.3)
+    np.testing.assert_allclose(ratio[1:], 1.0, atol=0.35)
     error = posterior.diagnostics["log_evidence_error"]
     assert abs(float(posterior.log_evidence) - evidence) < 0.05 + 4.0 * error
