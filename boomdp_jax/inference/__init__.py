@@ -1,6 +1,8 @@
 """From a history to a posterior over Φ and over which constraints exist."""
 
 from boomdp_jax.inference.fitted_kernel import structure_kernel as structure_kernel
+from boomdp_jax.inference.identifiability import Identifiability as Identifiability
+from boomdp_jax.inference.identifiability import identifiability as identifiability
 from boomdp_jax.inference.infer import METHODS as METHODS
 from boomdp_jax.inference.infer import infer as infer
 from boomdp_jax.inference.infer import infer_batch as infer_batch
@@ -36,6 +38,7 @@ from boomdp_jax.inference.target import StructureTarget as StructureTarget
 __all__ = [
     "METHODS",
     "BeliefState",
+    "Identifiability",
     "InformationGain",
     "KindPrior",
     "KindsPosterior",
@@ -51,6 +54,7 @@ __all__ = [
     "StructureTarget",
     "Sweep",
     "begin_sweep",
+    "identifiability",
     "infer",
     "infer_batch",
     "infer_kinds",
