@@ -39,6 +39,7 @@ from boomdp_jax.inference.online_window import in_whole_table, windowed
 from boomdp_jax.inference.structure_draws import start_mixtures
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.tempered_smc import temper
+from boomdp_jax.inference.typical_noise import with_typical_gains
 from boomdp_jax.inference.weighing import evaluate_each
 from boomdp_jax.physics.scene_spec import SceneSpec
 
@@ -249,9 +250,11 @@ def _fit(
     """Modes, mixture and evidence on the rows of a history that ended some time ago."""
     fit_key, draw_key = jax.random.split(key)
     block = make_online_block(settings, bodies, history, age=age)
+    rng = host_generator(draw_key)
     found = find_modes(fit_key, stack_blocks([block]), settings.fit)
+    found = with_typical_gains(rng, found, settings.fit)
     mixtures, evidence = adapt_mixtures(
-        host_generator(draw_key),
+        rng,
         found.targets,
         start_mixtures(found.targets, found.modes),
         _NUM_DRAWS,
