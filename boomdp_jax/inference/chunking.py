@@ -5,9 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-_CHUNK = 32
-_CHUNKS_PER_CALL = 4
-
 
 class Chunking(NamedTuple):
     """Which points go together, and back again; on the host."""
@@ -19,10 +16,17 @@ class Chunking(NamedTuple):
     num_chunks: int
     """Without those that fill up the last call."""
     num_points: int
+    per_call: int
 
     @classmethod
     def of(
-        cls, index: np.ndarray, structure: np.ndarray, num_structures: int
+        cls,
+        index: np.ndarray,
+        structure: np.ndarray,
+        num_structures: int,
+        *,
+        size: int = 16,
+        per_call: int = 4,
     ) -> "Chunking":
         """Sort points by object and structure.
 
@@ -30,33 +34,35 @@ class Chunking(NamedTuple):
             index: object of each point.
             structure: of each point.
             num_structures: of each object.
+            size: points of a chunk.
+            per_call: chunks of a call.
         """
         group = index.astype(np.int64) * num_structures + structure
         order = np.argsort(group, kind="stable")
         names, begins, sizes = np.unique(
             group[order], return_index=True, return_counts=True
         )
-        counts = -(-sizes // _CHUNK)
+        counts = -(-sizes // size)
         total = int(counts.sum())
-        padded = -(-total // _CHUNKS_PER_CALL) * _CHUNKS_PER_CALL
-        source = np.zeros((padded, _CHUNK), np.int64)
+        padded = -(-total // per_call) * per_call
+        source = np.zeros((padded, size), np.int64)
         owner = np.zeros(padded, np.int64)
         first = 0
-        for name, begin, size, count in zip(names, begins, sizes, counts, strict=True):
-            places = np.full(count * _CHUNK, order[begin])
-            places[:size] = order[begin : begin + size]
-            source[first : first + count] = places.reshape(count, _CHUNK)
+        for name, begin, num, count in zip(names, begins, sizes, counts, strict=True):
+            places = np.full(count * size, order[begin])
+            places[:num] = order[begin : begin + num]
+            source[first : first + count] = places.reshape(count, size)
             owner[first : first + count] = name
             first += count
         if first:
             source[first:], owner[first:] = source[0, 0], owner[0]
         pairs = np.stack(np.divmod(owner, num_structures), axis=1)
-        return cls(pairs, source, total, len(index))
+        return cls(pairs, source, total, len(index), per_call)
 
     def calls(self) -> Iterator[tuple[tuple[np.ndarray, np.ndarray], np.ndarray]]:
         """Object and structure of a call's chunks, and their points, call by call."""
-        for begin in range(0, len(self.owner), _CHUNKS_PER_CALL):
-            rows = slice(begin, begin + _CHUNKS_PER_CALL)
+        for begin in range(0, len(self.owner), self.per_call):
+            rows = slice(begin, begin + self.per_call)
             yield (self.owner[rows, 0], self.owner[rows, 1]), self.source[rows]
 
     def in_order(self, found: list[np.ndarray]) -> np.ndarray:

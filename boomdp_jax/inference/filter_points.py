@@ -26,8 +26,8 @@ def _gather_chunks(targets: StructureTarget, index, structure, z, noise) -> tupl
 def _densities_of_chunks(known, active, z, noise):
     """Log-likelihoods of chunks `[chunk, point, ...]`."""
 
-    def one_chunk(known, active, z, noise):
-        coordinates, data = known
+    def one_chunk(chunk):
+        (coordinates, data), active, z, noise = chunk
 
         def one_point(active, z, noise):
             params = coordinates(z, active)
@@ -35,7 +35,8 @@ def _densities_of_chunks(known, active, z, noise):
 
         return jax.vmap(one_point)(active, z, noise)
 
-    return jax.vmap(one_chunk)(known, active, z, noise)
+    # One after the other, see `evaluate`.
+    return jax.lax.map(one_chunk, (known, active, z, noise))
 
 
 _DENSITIES = Program(_gather_chunks, _densities_of_chunks)
@@ -61,7 +62,7 @@ def filter_densities(
         `[point]`, minus infinity where the filter's result is not finite.
     """
     # Nothing here belongs to a structure as gains do: chunks are of one object.
-    chunks = Chunking.of(index, np.zeros_like(structure), 1)
+    chunks = Chunking.of(index, np.zeros_like(structure), 1, size=32, per_call=2)
     dtype = targets.log_prior.dtype
     inputs = [
         (

