@@ -172,10 +172,14 @@ def _merge(
         kind: np.zeros(fields[kind]["active"].shape[1:], bool) for kind in fields
     }
     density = np.array(arrays.density)
+    center = np.zeros((*shape, 2))
+    has_center = any(part.center_of_mass is not None for part in parts)
     first = {kind: 0 for kind in JOINTS if kind in fields}
     for block, part in zip(blocks, parts, strict=True):
         index = np.asarray(block.bodies)
         density[:, index] = np.asarray(part.density)
+        if part.center_of_mass is not None:
+            center[:, index] = np.asarray(part.center_of_mass)
         to_scene = np.append(index, WORLD)
         for kind in fields:
             group = getattr(part, kind)
@@ -216,6 +220,7 @@ def _merge(
     params = Params(
         density=on_device(density, dtype),
         **{kind: build(kind) for kind in fields},
+        center_of_mass=on_device(center, dtype) if has_center else None,
     )
     return params, inferred
 

@@ -51,6 +51,8 @@ class Surroundings(eqx.Module):
     """Mean of the observed positions [m]."""
     spread: Float[Array, " body"]
     """How far from it the positions lie [m]."""
+    centroid: Float[Array, "body 2"]
+    """Where the centre of mass should be, in the frame of the body's pose [m]."""
     rest: Float[Array, "rest 4"]
     """Pose of `Layout.rests` and the way they moved most; see `rest_pose`."""
     density: Float[Array, " body"]
@@ -107,6 +109,12 @@ def surroundings(
         box_center=on_device((highs + lows) / 2),
         center=on_device(np.stack(centers)),
         spread=on_device(spreads),
+        centroid=on_device(
+            [
+                body.moments.centroid if body.is_center_unknown else np.zeros(2)
+                for body in (spec.bodies[i] for i in bodies)
+            ]
+        ),
         rest=on_device(np.reshape(rest, (-1, 4))),
         density=on_device(
             [
@@ -227,7 +235,21 @@ class Coordinates(eqx.Module):
             if "prismatic" in has
             else None,
             weld=Weld(**self._joint_arrays("weld", made)) if "weld" in has else None,
+            center_of_mass=self._centers(z),
         )
+
+    def _centers(self, z: Float[Array, " dim"]) -> Float[Array, "body 2"] | None:
+        """Centres of mass in the frames of the poses; None where all are known."""
+        places = [n for n in self.layout.numbers if n.name == "center_of_mass"]
+        if not places:
+            return None
+        centers = jnp.zeros((self.layout.num_bodies, 2))
+        for number in places:
+            offset = self._scaled("center_of_mass", z[number.start : number.start + 2])
+            unit = jnp.sqrt(self.scene.gyration[number.body])
+            center = self.surroundings.centroid[number.body] + unit * offset
+            centers = centers.at[number.body].set(center)
+        return centers
 
     def _scaled(self, name: str, z):
         return self.scales.center[name] + self.scales.spread[name] * z

@@ -29,6 +29,19 @@ wheel's heading, a drawer's axis."""
 _MAX_STRUCTURES = 4096
 
 
+BODY_NUMBERS = {"center_of_mass": 2}
+"""Coordinates of what may be inferred of a body besides its density."""
+
+
+class BodyNumber(NamedTuple):
+    """What is inferred of a body besides its density."""
+
+    name: str
+    body: int
+    start: int
+    """First coordinate."""
+
+
 class SlotKey(NamedTuple):
     """One place in `Params` that a constraint may take."""
 
@@ -46,7 +59,7 @@ class SlotKey(NamedTuple):
 class Layout(NamedTuple):
     """Slots and coordinates of a block; static, so that equal blocks share a program.
 
-    Coordinates: the log-density of each body, then those of each slot.
+    Coordinates: the log-density of each body, those of each slot, then the rest.
     """
 
     num_bodies: int
@@ -55,6 +68,7 @@ class Layout(NamedTuple):
     known_slots: tuple[SlotKey, ...]
     """Slots of constraints that are known to exist."""
     dim: int
+    numbers: tuple[BodyNumber, ...] = ()
 
     def count(self, kind: str) -> int:
         """How many slots of a kind `Params` needs (per body for wheel and ground)."""
@@ -129,7 +143,12 @@ def block_layout(spec: SceneSpec, bodies: tuple[int, ...]) -> Layout:
         if spec.unknown.get(kind, 0):
             for i, j in itertools.combinations(movable, 2):
                 add(inferred, kind, i, j, -1)
-    return Layout(len(bodies), tuple(inferred), tuple(known), start)
+    numbers = []
+    for i in movable:
+        if spec.is_center_unknown[bodies[i]]:
+            numbers.append(BodyNumber("center_of_mass", i, start))
+            start += BODY_NUMBERS["center_of_mass"]
+    return Layout(len(bodies), tuple(inferred), tuple(known), start, tuple(numbers))
 
 
 def _refuse_drives(spec: SceneSpec) -> None:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from numpyro.distributions import constraints, transforms
 
 from boomdp_jax.inference.block import Block
-from boomdp_jax.inference.layout import SlotKey
+from boomdp_jax.inference.layout import BODY_NUMBERS, BodyNumber, SlotKey
 from boomdp_jax.inference.prior import LOGARITHMIC
 from boomdp_jax.inference.slot_names import slot_names
 from boomdp_jax.physics.params import WORLD
@@ -165,6 +165,10 @@ def block_sites(block: Block, names: tuple[str, ...]) -> tuple[Site, ...]:
         )
         for index, name in enumerate(names)
     ]
+    sites += [
+        _body_site(number, names[number.body], likelihood.coordinates)
+        for number in block.layout.numbers
+    ]
     for slot, name in slot_names(names, block.layout).items():
         sites += _slot_sites(slot, name, likelihood.coordinates)
     kept = []
@@ -184,6 +188,22 @@ def block_sites(block: Block, names: tuple[str, ...]) -> tuple[Site, ...]:
                 for place in free
             ]
     return tuple(kept)
+
+
+def _body_site(number: BodyNumber, name: str, coordinates: Any) -> Site:
+    """Site of what is inferred of a body besides its density."""
+    count = BODY_NUMBERS[number.name]
+    center = coordinates.scales.center[number.name]
+    spread = coordinates.scales.spread[number.name]
+    unit = jnp.sqrt(coordinates.scene.gyration[number.body])
+    origin = coordinates.surroundings.centroid[number.body]
+    return Site(
+        f"{name}.{number.name}",
+        tuple(range(number.start, number.start + count)),
+        "identity",
+        origin + jnp.broadcast_to(unit * center, (count,)),
+        jnp.broadcast_to(unit * spread, (count,)),
+    )
 
 
 def _slot_sites(slot: SlotKey, name: str, coordinates: Any) -> list[Site]:

@@ -45,6 +45,7 @@ class ObjectModel(eqx.Module):
     """A NumPyro model of the bodies of a scene that can move; made by `make_model`.
 
     Sample sites, by body and constraint: `table.density` [kg/m²];
+    `table.center_of_mass` [m] where it is unknown;
     `table.revolute.anchor_a`, `anchor_b` [m], `viscous_rate` [1/s], `dry_share`;
     `table.distance.length` [m]; `table.prismatic.axis` [rad] (to be read modulo half a
     turn), `offset` of the line from where the body was seen [m], `angle` [rad],

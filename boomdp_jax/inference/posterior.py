@@ -149,6 +149,8 @@ class Posterior(eqx.Module):
                 np.asarray(params.density),
                 weights,
                 np.asarray(prior.density),
+                _double(self.params.center_of_mass),
+                _double(self.prior_params.center_of_mass),
             ),
             "structure": report_structures(
                 self.spec, params, weights, prior, self.inferred

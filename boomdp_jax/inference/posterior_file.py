@@ -36,6 +36,9 @@ _GROUPS = {
 _OPTIONAL = ("prismatic", "weld")
 """Groups that a file may do without: scenes may, and those of earlier versions did."""
 
+_BODY_NUMBERS = {"center_of_mass": ("body", 2)}
+"""Numbers of bodies that are there where they are inferred."""
+
 _KINDS = {"active": "b", "body_a": "i", "body_b": "i", "chain": "i"}
 """Kind of an array by the last part of its name; all others hold floats."""
 
@@ -145,6 +148,9 @@ def read_posterior_file(
 def _flatten(prefix: str, params: Params) -> dict[str, np.ndarray]:
     """Arrays of params by dotted name; nuisances that are None are left out."""
     arrays = {f"{prefix}.density": np.asarray(params.density)}
+    for name in _BODY_NUMBERS:
+        if getattr(params, name) is not None:
+            arrays[f"{prefix}.{name}"] = np.asarray(getattr(params, name))
     for group in _GROUPS:
         module = getattr(params, group)
         if module is None:
@@ -169,6 +175,9 @@ def _unflatten(prefix: str, arrays: Mapping[str, np.ndarray]) -> Params:
             array = arrays.get(f"{prefix}.{group}.{name}")
             numbers[name] = None if array is None else jnp.asarray(array)
         groups[group] = module(**numbers)
+    for name in _BODY_NUMBERS:
+        if f"{prefix}.{name}" in arrays:
+            groups[name] = jnp.asarray(arrays[f"{prefix}.{name}"])
     return Params(density=jnp.asarray(arrays[f"{prefix}.density"]), **groups)
 
 
@@ -187,6 +196,9 @@ def _expected_shapes(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple]:
     }
     for prefix, draw in (("params", "draw"), ("prior_params", "prior draw")):
         shapes[f"{prefix}.density"] = (draw, *_PARAM_SHAPES["density"])
+        for name, axes in _BODY_NUMBERS.items():
+            if any(f"{each}.{name}" in arrays for each in ("params", "prior_params")):
+                shapes[f"{prefix}.{name}"] = (draw, *axes)
         for group, module in _GROUPS.items():
             if not _has(group, arrays):
                 continue

@@ -52,16 +52,22 @@ def report_bodies(
     density: np.ndarray,
     weights: np.ndarray,
     prior_density: np.ndarray,
+    center: np.ndarray | None = None,
+    prior_center: np.ndarray | None = None,
 ) -> dict:
     """Density [kg/m²] and mass [kg] of every body that can move, by name.
 
-    A density that the scene file gives counts as identified.
+    A density that the scene file gives counts as identified. An unknown centre of mass
+    is reported in the frame of the outline as authored [m].
 
     Args:
         spec: the scene.
         density: draws, `[draw, body]`.
         weights: of the draws, sum to one, `[draw]`.
         prior_density: prior draws, `[draw, body]`.
+        center: draws of the centres of mass in the frames of the poses, `[draw, body,
+            2]`; None: all are known.
+        prior_center: prior draws of them.
 
     Returns:
         Marginal summaries over structure, and `identified`, which is the mass's.
@@ -80,6 +86,14 @@ def report_bodies(
             "mass": mass,
             "identified": mass["identified"],
         }
+        if center is not None and prior_center is not None:
+            if not spec.is_center_unknown[index]:
+                continue
+            report[body.name]["center_of_mass"] = summarise(
+                center[:, index] + body.shift,
+                weights,
+                prior_center[:, index] + body.shift,
+            )
     return report
 
 
@@ -217,6 +231,10 @@ def format_report(report: dict, structures: dict[str, float], num_draws: int) ->
             f"{name:<16}{_interval(body['mass']):<32}{_interval(body['density']):<32}"
             f"{'yes' if body['identified'] else 'no: the prior'}"
         )
+    for name, body in report["bodies"].items():
+        if "center_of_mass" in body:
+            text = _quantity(body["center_of_mass"], ["m", "m"])
+            lines.append(f"{name:<16}centre of mass at {text} of the outline")
     lines += ["", f"{'structure':<48}probability"]
     for name, probability in structures.items():
         if probability >= _LEAST_SHOWN:

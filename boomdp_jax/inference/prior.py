@@ -59,6 +59,9 @@ DEFAULT_SCALES: dict[str, Scale] = {
     # Share of decoupled torque: logit-normal. Load shift in radii: normal.
     "ground.torque_share": Scale(-1.0, 1.5),
     "ground.load_shift": Scale(0.0, 0.1),
+    # How far it is from the centroid (or where the scene file says it should be), in
+    # units of the outline's radius of gyration: normal.
+    "center_of_mass": Scale(0.0, 0.3),
 }
 """Centre and spread of every quantity that is inferred."""
 

@@ -52,13 +52,17 @@ def physical_numbers(
         area: of the bodies' outlines [m²].
 
     Returns:
-        Density [kg/m²] and mass [kg] of each body, and the numbers of each slot, in
-        the units of `physics.params`; zero where a slot is not active.
+        Density [kg/m²] and mass [kg] of each body, its centre of mass [m] where that
+        is inferred, and the numbers of each slot, in the units of `physics.params`;
+        zero where a slot is not active.
     """
     numbers = {}
     for index, name in enumerate(names):
         numbers[f"{name}.density"] = params.density[index]
         numbers[f"{name}.mass"] = params.density[index] * area[index]
+    for number in layout.numbers:
+        value = getattr(params, number.name)[number.body]
+        numbers[f"{names[number.body]}.{number.name}"] = value
     for slot, name in slot_names(names, layout).items():
         group = getattr(params, slot.kind)
         is_joint = slot.kind in JOINTS

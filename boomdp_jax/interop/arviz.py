@@ -10,6 +10,7 @@ import numpy as np
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.summary import CHANNELS
 from boomdp_jax.physics.constraint_spec import JOINTS, KINDS
+from boomdp_jax.physics.params import Params
 
 _SUFFIX_DIMS = {
     "anchor_a": ("axis",),
@@ -87,7 +88,7 @@ def _num_chains(chain: np.ndarray) -> int:
 
 
 def _variables(
-    posterior: Posterior, params: object, noise: dict
+    posterior: Posterior, params: Params, noise: dict
 ) -> tuple[dict[str, np.ndarray], dict[str, list[str]]]:
     """Arrays by name, leading axis draw, and the names of their other axes."""
     params = jax.tree.map(np.asarray, params)
@@ -102,6 +103,9 @@ def _variables(
         "mass": ["body"],
         "noise_scale": ["body", "channel"],
     }
+    if params.center_of_mass is not None:
+        numbers["center_of_mass"] = params.center_of_mass
+        dims["center_of_mass"] = ["body", "axis"]
     if "impulse_scale" in numbers:
         dims["impulse_scale"] = ["body", "impulse"]
     slot_dims = {

@@ -137,6 +137,9 @@ class Params(eqx.Module):
     """What contact is like; needed in scenes with contact (`Scene.collides`)."""
     prismatic: Prismatic | None = None
     weld: Weld | None = None
+    center_of_mass: Float[Array, "*batch body 2"] | None = None
+    """Where it lies in the body frame, whose origin is the reference point of states
+    and wrenches [m]; None: there."""
 
 
 def empty_params(
