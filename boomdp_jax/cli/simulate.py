@@ -78,6 +78,7 @@ def simulate(
     """Apply wrenches row by row; each episode starts from the initial state.
 
     A force that acts at a point acts there as the body stands when the step begins.
+    Where the params have a delay, a force from earlier acts at the point of the row.
 
     Args:
         scene: the scene.
@@ -88,7 +89,7 @@ def simulate(
     Returns:
         States before and after each row.
     """
-    from boomdp_jax.physics import step
+    from boomdp_jax.physics import delayed_wrenches, step
     from boomdp_jax.physics.world_rollout import empty_cache
 
     first = (initial_state, empty_cache(scene))
@@ -104,7 +105,10 @@ def simulate(
         next_state, info = step(scene, params, state, wrench, dt=dt, cache=cache)
         return (next_state, info.cache), (state.array, next_state.array)
 
-    rows = (actions.action, actions.point, actions.dt, actions.is_start)
+    commands = delayed_wrenches(
+        params, actions.action, actions.dt, is_start=actions.is_start
+    )
+    rows = (commands, actions.point, actions.dt, actions.is_start)
     rows = jax.tree.map(jnp.asarray, rows)
     run_rows = jax.jit(lambda rows: jax.lax.scan(advance, first, rows)[1])
     before, after = run_rows(rows)

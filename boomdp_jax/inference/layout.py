@@ -29,8 +29,14 @@ wheel's heading, a drawer's axis."""
 _MAX_STRUCTURES = 4096
 
 
-BODY_NUMBERS = {"center_of_mass": 2}
-"""Coordinates of what may be inferred of a body besides its density."""
+BODY_NUMBERS = {
+    "center_of_mass": 2,
+    "actuator.gain": 1,
+    "actuator.bias": 3,
+    "actuator.delay": 1,
+}
+"""Coordinates of what may be inferred of a body besides its density; a name is the way
+to it in `Params`."""
 
 
 class BodyNumber(NamedTuple):
@@ -91,6 +97,11 @@ class Layout(NamedTuple):
         return out
 
     @property
+    def has_delay(self) -> bool:
+        """Whether commands take effect later than they were given."""
+        return any(number.name == "actuator.delay" for number in self.numbers)
+
+    @property
     def rests(self) -> tuple[SlotKey, ...]:
         """Slots whose numbers are measured from where the bodies were seen."""
         slots = sorted(self.slots + self.known_slots, key=lambda slot: slot.start)
@@ -145,9 +156,13 @@ def block_layout(spec: SceneSpec, bodies: tuple[int, ...]) -> Layout:
                 add(inferred, kind, i, j, -1)
     numbers = []
     for i in movable:
-        if spec.is_center_unknown[bodies[i]]:
-            numbers.append(BodyNumber("center_of_mass", i, start))
-            start += BODY_NUMBERS["center_of_mass"]
+        for name, count in BODY_NUMBERS.items():
+            is_unknown = name in spec.unknown_numbers
+            if name == "center_of_mass":
+                is_unknown = bool(spec.is_center_unknown[bodies[i]])
+            if is_unknown:
+                numbers.append(BodyNumber(name, i, start))
+                start += count
     return Layout(len(bodies), tuple(inferred), tuple(known), start, tuple(numbers))
 
 

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from numpyro.distributions import constraints, transforms
 
 from boomdp_jax.inference.block import Block
+from boomdp_jax.inference.body_numbers import number_scale
 from boomdp_jax.inference.layout import BODY_NUMBERS, BodyNumber, SlotKey
 from boomdp_jax.inference.prior import LOGARITHMIC
 from boomdp_jax.inference.slot_names import slot_names
@@ -195,14 +196,16 @@ def _body_site(number: BodyNumber, name: str, coordinates: Any) -> Site:
     count = BODY_NUMBERS[number.name]
     center = coordinates.scales.center[number.name]
     spread = coordinates.scales.spread[number.name]
-    unit = jnp.sqrt(coordinates.scene.gyration[number.body])
-    origin = coordinates.surroundings.centroid[number.body]
+    origin, unit = number_scale(
+        number, coordinates.surroundings, coordinates.scene.gyration
+    )
+    loc, scale = origin + unit * center, unit * spread
     return Site(
         f"{name}.{number.name}",
         tuple(range(number.start, number.start + count)),
-        "identity",
-        origin + jnp.broadcast_to(unit * center, (count,)),
-        jnp.broadcast_to(unit * spread, (count,)),
+        "log" if number.name in LOGARITHMIC else "identity",
+        loc if count > 1 else loc[0],
+        scale if count > 1 else scale[0],
     )
 
 

@@ -11,6 +11,8 @@ import numpy as np
 
 from boomdp_jax.core.json_header import read_json_header
 from boomdp_jax.core.npz_file import read_npz, write_npz
+from boomdp_jax.inference.body_numbers import get_number, with_numbers
+from boomdp_jax.inference.layout import BODY_NUMBERS
 from boomdp_jax.physics.params import (
     Distance,
     Ground,
@@ -36,7 +38,10 @@ _GROUPS = {
 _OPTIONAL = ("prismatic", "weld")
 """Groups that a file may do without: scenes may, and those of earlier versions did."""
 
-_BODY_NUMBERS = {"center_of_mass": ("body", 2)}
+_BODY_NUMBERS = {
+    name: ("body", count) if count > 1 else ("body",)
+    for name, count in BODY_NUMBERS.items()
+}
 """Numbers of bodies that are there where they are inferred."""
 
 _KINDS = {"active": "b", "body_a": "i", "body_b": "i", "chain": "i"}
@@ -149,8 +154,9 @@ def _flatten(prefix: str, params: Params) -> dict[str, np.ndarray]:
     """Arrays of params by dotted name; nuisances that are None are left out."""
     arrays = {f"{prefix}.density": np.asarray(params.density)}
     for name in _BODY_NUMBERS:
-        if getattr(params, name) is not None:
-            arrays[f"{prefix}.{name}"] = np.asarray(getattr(params, name))
+        value = get_number(params, name)
+        if value is not None:
+            arrays[f"{prefix}.{name}"] = np.asarray(value)
     for group in _GROUPS:
         module = getattr(params, group)
         if module is None:
@@ -175,10 +181,13 @@ def _unflatten(prefix: str, arrays: Mapping[str, np.ndarray]) -> Params:
             array = arrays.get(f"{prefix}.{group}.{name}")
             numbers[name] = None if array is None else jnp.asarray(array)
         groups[group] = module(**numbers)
-    for name in _BODY_NUMBERS:
-        if f"{prefix}.{name}" in arrays:
-            groups[name] = jnp.asarray(arrays[f"{prefix}.{name}"])
-    return Params(density=jnp.asarray(arrays[f"{prefix}.density"]), **groups)
+    params = Params(density=jnp.asarray(arrays[f"{prefix}.density"]), **groups)
+    numbers = {
+        name: jnp.asarray(arrays[f"{prefix}.{name}"])
+        for name in _BODY_NUMBERS
+        if f"{prefix}.{name}" in arrays
+    }
+    return with_numbers(params, numbers)
 
 
 def _has(group: str, arrays: Mapping[str, np.ndarray]) -> bool:

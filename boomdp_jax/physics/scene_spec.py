@@ -42,8 +42,8 @@ SCENE_SCHEMA = "planar-scene-1"
 STANDARD_GRAVITY = 9.81
 """Load on floor and wheels of a scene seen from above, if it gives none [m/s²]."""
 
-UNKNOWN_NUMBERS = ("center_of_mass",)
-"""What `unknown` may have besides constraints, for all bodies that can move."""
+ACTUATOR_NUMBERS = ("gain", "bias", "delay")
+"""What `unknown.actuator` may list; see `physics.actuator`."""
 
 _MAX_UNKNOWN = 100
 _OPTIONAL_FIELDS = ("gravity", "normal_gravity", "constraints", "unknown", "prior")
@@ -69,7 +69,8 @@ class SceneSpec:
     source: str
     """Where it comes from, for messages."""
     unknown_numbers: frozenset[str] = frozenset()
-    """Those of `UNKNOWN_NUMBERS` that are to be inferred."""
+    """What is to be inferred of every body that can move: `center_of_mass`,
+    `actuator.gain`, `actuator.bias`, `actuator.delay`."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -212,8 +213,7 @@ class SceneSpec:
                 constraint_to_dict(constraint, self.bodies)
                 for constraint in self.constraints
             ],
-            "unknown": dict(self.unknown)
-            | dict.fromkeys(sorted(self.unknown_numbers), True),
+            "unknown": dict(self.unknown) | _unknown_to_dict(self.unknown_numbers),
             "prior": json.loads(json.dumps(self.prior)),
         }
 
@@ -254,7 +254,7 @@ def scene_spec_from_dict(content: object, source: str = "scene") -> SceneSpec:
     caps = read_object(
         fields.get("unknown", {}),
         f"{source}: unknown",
-        optional=(*KINDS, *UNKNOWN_NUMBERS),
+        optional=(*KINDS, "center_of_mass", "actuator"),
     )
     prior = fields.get("prior", {})
     if not isinstance(prior, dict):
@@ -274,14 +274,32 @@ def scene_spec_from_dict(content: object, source: str = "scene") -> SceneSpec:
         },
         prior=prior,
         source=source,
-        unknown_numbers=frozenset(
-            name
-            for name in UNKNOWN_NUMBERS
-            if read_flag(caps.get(name, False), f"{source}: unknown.{name}")
-        ),
+        unknown_numbers=_read_unknown_numbers(caps, f"{source}: unknown"),
     )
     _check_centers(spec)
     return spec
+
+
+def _read_unknown_numbers(caps: dict, where: str) -> frozenset[str]:
+    """Names of numbers of bodies that are to be inferred."""
+    numbers = read_list(caps.get("actuator", []), f"{where}.actuator")
+    for number in numbers:
+        if number not in ACTUATOR_NUMBERS:
+            expected = f"a list of some of {', '.join(ACTUATOR_NUMBERS)}"
+            refuse(f"{where}.actuator", expected, number)
+    names = {f"actuator.{number}" for number in numbers}
+    if read_flag(caps.get("center_of_mass", False), f"{where}.center_of_mass"):
+        names.add("center_of_mass")
+    return frozenset(names)
+
+
+def _unknown_to_dict(names: frozenset[str]) -> dict:
+    """The inverse of `_read_unknown_numbers`."""
+    entry: dict = {}
+    if "center_of_mass" in names:
+        entry["center_of_mass"] = True
+    numbers = [n for n in ACTUATOR_NUMBERS if f"actuator.{n}" in names]
+    return entry | ({"actuator": numbers} if numbers else {})
 
 
 def _check_centers(spec: SceneSpec) -> None:

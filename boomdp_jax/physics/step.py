@@ -52,6 +52,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from boomdp_jax.physics.actuator import applied, without_actuator
 from boomdp_jax.physics.center_of_mass import (
     about_center,
     state_of_center,
@@ -92,7 +93,8 @@ def step(
         state: poses and twists.
         wrench: forces and torques at the reference points of the states, which are the
             centres of mass unless `Params.center_of_mass` says otherwise; world frame,
-            constant over the step [N, N, N m].
+            constant over the step [N, N, N m]. Gain and bias of `Params.actuator` are
+            applied to them, its delay has to be before (`delayed_wrenches`).
         dt: length of the step [s]; default: the scene's.
         cache: `StepInfo.cache` of the step before; may be left out.
 
@@ -151,6 +153,11 @@ def rollout(
         The states after each step and their reports, with a leading time axis.
     """
     length = jnp.asarray(scene.dt if dt is None else dt, state.pose.dtype)
+    if params.actuator is not None:
+        wrenches = jax.vmap(lambda wrench: applied(params, wrench, scene.is_static))(
+            wrenches
+        )
+        return rollout(scene, without_actuator(params), state, wrenches, dt=length)
     if params.center_of_mass is not None:
         return _rollout_of_reference(scene, params, state, wrenches, length)
     if not is_lone(scene, params):
@@ -193,6 +200,11 @@ def _rollout_of_reference(
 
 def _step_of(scene: Scene, params: Params, length: Array) -> Callable:
     """A function from state, wrench and cache, with what is constant worked out."""
+    if params.actuator is not None:
+        advance_applied = _step_of(scene, without_actuator(params), length)
+        return lambda state, wrench, cache: advance_applied(
+            state, applied(params, wrench, scene.is_static), cache
+        )
     if params.center_of_mass is not None:
         advance_center = _step_of(*about_center(scene, params), length)
 

@@ -328,3 +328,16 @@ def test_an_unknown_centre_of_mass_that_makes_no_sense_is_refused(
 ):
     with pytest.raises(ValueError, match=message):
         scene_spec_from_dict({**_scene(), **changes})
+
+
+def test_numbers_of_the_actuator_may_be_unknown():
+    content = {**_scene(), "unknown": {"wheel": 1, "actuator": ["delay", "gain"]}}
+    spec = scene_spec_from_dict(content)
+    assert spec.unknown_numbers == {"actuator.delay", "actuator.gain"}
+    written = json.loads(json.dumps(spec.to_dict()))
+    assert written["unknown"]["actuator"] == ["gain", "delay"]
+    assert scene_spec_from_dict(written).unknown_numbers == spec.unknown_numbers
+    for wrong in ("gain", ["drift"], [1], True):
+        content["unknown"]["actuator"] = wrong
+        with pytest.raises(ValueError, match=r"unknown\.actuator: expected a list"):
+            scene_spec_from_dict(content)
