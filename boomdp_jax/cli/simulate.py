@@ -6,10 +6,11 @@ import json
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from boomdp_jax.cli.output import check_writable, print_notes, versions
 from boomdp_jax.core.action_file import ActionTable, load_actions
+from boomdp_jax.core.applied_force import wrench_at_reference
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.core.history_file import save_transitions
 from boomdp_jax.physics.params import Params
@@ -77,6 +78,7 @@ def simulate(
     """Apply wrenches row by row; each episode starts from the initial state.
 
     A force that acts at a point acts there as the body stands when the step begins.
+    Where the params have a delay, a force from earlier acts at the point of the row.
 
     Args:
         scene: the scene.
@@ -87,7 +89,7 @@ def simulate(
     Returns:
         States before and after each row.
     """
-    from boomdp_jax.physics import step
+    from boomdp_jax.physics import delayed_wrenches, step
     from boomdp_jax.physics.world_rollout import empty_cache
 
     first = (initial_state, empty_cache(scene))
@@ -97,11 +99,16 @@ def simulate(
         state, cache = jax.tree.map(
             lambda now, start: jnp.where(is_start, start, now), carry, first
         )
-        wrench = action if point is None else _wrench_at_centre(action, point, state)
+        wrench = action
+        if point is not None:
+            wrench = wrench_at_reference(action, point, state.pose)
         next_state, info = step(scene, params, state, wrench, dt=dt, cache=cache)
         return (next_state, info.cache), (state.array, next_state.array)
 
-    rows = (actions.action, actions.point, actions.dt, actions.is_start)
+    commands = delayed_wrenches(
+        params, actions.action, actions.dt, is_start=actions.is_start
+    )
+    rows = (commands, actions.point, actions.dt, actions.is_start)
     rows = jax.tree.map(jnp.asarray, rows)
     run_rows = jax.jit(lambda rows: jax.lax.scan(advance, first, rows)[1])
     before, after = run_rows(rows)
@@ -144,16 +151,6 @@ def read_with_noise(
         np.roll(readings_after, 1, axis=0),
     )
     return readings_before, readings_after
-
-
-def _wrench_at_centre(
-    action: Float[Array, "body 3"], point: Float[Array, "body 2"], state: State
-) -> Float[Array, "body 3"]:
-    """Turn a force at a world point into a wrench; a body without force needs none."""
-    is_pushed = jnp.any(action[:, :2] != 0, axis=-1)
-    arm = jnp.where(is_pushed[:, None], point - state.pose[:, :2], 0.0)
-    torque = arm[:, 0] * action[:, 1] - arm[:, 1] * action[:, 0]
-    return action.at[:, 2].add(torque)
 
 
 def _load_params(arguments: argparse.Namespace, spec: SceneSpec) -> Params:

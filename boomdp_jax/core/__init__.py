@@ -2,6 +2,7 @@
 
 from boomdp_jax.core.action_file import ActionTable as ActionTable
 from boomdp_jax.core.action_file import load_actions as load_actions
+from boomdp_jax.core.applied_force import wrench_at_reference as wrench_at_reference
 from boomdp_jax.core.atomic import atomic_file as atomic_file
 from boomdp_jax.core.atomic import atomic_write as atomic_write
 from boomdp_jax.core.history import History as History
@@ -26,4 +27,5 @@ __all__ = [
     "make_history",
     "save_history",
     "save_transitions",
+    "wrench_at_reference",
 ]

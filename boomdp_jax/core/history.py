@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from boomdp_jax.core.applied_force import wrench_at_reference
 from boomdp_jax.core.arrays import IntScalar, on_device
 
 
@@ -109,18 +110,21 @@ def make_history(
     *,
     episode: np.ndarray | None = None,
     point: np.ndarray | None = None,
+    point_frame: str = "world",
     capacity: int | None = None,
 ) -> History:
     """Check a table of transitions and pad it to a capacity.
 
     Args:
         state: readings before each step, `[time, body, 6]`; NaN marks a missing one.
-        action: wrenches at the centre of mass, `[time, body, 3]` [N, N, N m].
+        action: wrenches at the centre of mass (the reference point of the states, if
+            that is unknown), `[time, body, 3]` [N, N, N m].
         next_state: readings after each step, like `state`.
         dt: length of a step [s], one for all or one per row.
         episode: which run a row belongs to, `[time]`; default: one run.
-        point: world point at which the force acts, `[time, body, 2]` [m], instead of
-            the centre of mass.
+        point: where the force acts instead, `[time, body, 2]` [m]; NaN twice: there.
+        point_frame: of those points, `world`, or `body`: about the reference point,
+            along the axes of the body as it was read before the step.
         capacity: rows to make room for; default: as many as there are.
 
     Returns:
@@ -128,7 +132,8 @@ def make_history(
 
     Raises:
         ValueError: a wrong shape, an action that is not finite, a step length that is
-            not positive, an infinite reading, or more rows than the capacity.
+            not positive, an infinite reading, a force at a point of a body that was not
+            seen, or more rows than the capacity.
     """
     state, action = np.asarray(state, float), np.asarray(action, float)
     next_state = np.asarray(next_state, float)
@@ -167,7 +172,9 @@ def make_history(
                 f"{array[row, body]} in row {row}, body {body}"
             )
     if point is not None:
-        action = _move_to_centre(action, point, state)
+        needed = 2 if point_frame == "world" else 3
+        _check_point(action, point, state[..., :needed])
+        action = wrench_at_reference(action, point, state[..., :3], frame=point_frame)
     is_chained = np.zeros(num_rows, bool)
     if num_rows > 1:
         now, before = state[1:], next_state[:-1]
@@ -191,12 +198,15 @@ def make_history(
     )
 
 
-def _move_to_centre(
-    action: np.ndarray, point: np.ndarray, state: np.ndarray
-) -> np.ndarray:
-    """Turn a force at a world point into a wrench at the centre of mass."""
-    arm = np.where(np.isfinite(point), point - state[..., :2], 0.0)
-    torque = arm[..., 0] * action[..., 1] - arm[..., 1] * action[..., 0]
-    return np.concatenate(
-        [action[..., :2], action[..., 2:] + np.nan_to_num(torque)[..., None]], axis=-1
-    )
+def _check_point(action: np.ndarray, point: np.ndarray, pose: np.ndarray) -> None:
+    """A torque about what was not seen would be made up."""
+    is_centred = np.all(np.isnan(point), axis=-1)
+    is_lost = np.any(np.isnan(pose), axis=-1)
+    is_lost |= ~np.all(np.isfinite(point), axis=-1)
+    is_lost &= np.any(action[..., :2] != 0, axis=-1) & ~is_centred
+    if np.any(is_lost):
+        row, body = np.argwhere(is_lost)[0]
+        raise ValueError(
+            f"point: expected a pose of body {body} and both numbers of the point (or "
+            f"NaN for both) wherever a force acts, got none in row {row}"
+        )

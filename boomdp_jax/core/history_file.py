@@ -154,8 +154,8 @@ def save_transitions(
         next_state: readings after each step, like `state`.
         dt: length of a step [s], one for all or one per row.
         episode: which run a row belongs to; default: one run.
-        point: world point at which the force acts, `[time, body, 2]` [m]; default: the
-            centre of mass.
+        point: world point at which the force acts, `[time, body, 2]` [m]; NaN twice,
+            or default: the reference point of the state, its centre of mass.
         params: JSON about where the data came from.
 
     Raises:

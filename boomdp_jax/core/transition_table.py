@@ -49,7 +49,8 @@ class TransitionTable:
     dt: Float[np.ndarray, " time"]
     episode: Int[np.ndarray, " time"]
     point: Float[np.ndarray, "time body 2"] | None
-    """World point at which the force acts [m]; None: the centre of mass."""
+    """World point at which the force acts [m]; None, or NaN twice: the reference point
+    of the state."""
     params: str | None
     """JSON about where the data came from; never used for inference."""
     source: str
@@ -71,7 +72,6 @@ class TransitionTable:
         Raises:
             ValueError: a force acts at a point while the body's position is missing.
         """
-        self._check_point()
         try:
             return make_history(
                 self.state,
@@ -84,20 +84,6 @@ class TransitionTable:
             )
         except ValueError as error:
             raise ValueError(f"{self.source}: {error}") from error
-
-    def _check_point(self) -> None:
-        """A torque about a centre of mass that was not seen would be made up."""
-        if self.point is None:
-            return
-        is_pushed = np.any(self.action[..., :2] != 0, axis=-1)
-        is_lost = np.any(np.isnan(self.state[..., :2]), axis=-1)
-        is_lost |= ~np.all(np.isfinite(self.point), axis=-1)
-        if np.any(is_pushed & is_lost):
-            row, body = np.argwhere(is_pushed & is_lost)[0]
-            raise ValueError(
-                f"{self.source}: point: expected a position of body {body} and a point "
-                f"wherever a force acts, got none in row {row}"
-            )
 
 
 def make_transition_table(

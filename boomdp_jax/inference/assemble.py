@@ -8,7 +8,9 @@ import numpy as np
 from boomdp_jax.core.arrays import Key, on_device
 from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.inference.block import Block
+from boomdp_jax.inference.body_numbers import UNASKED, get_number, with_numbers
 from boomdp_jax.inference.evidence_report import BlockResult, report_evidence
+from boomdp_jax.inference.layout import BODY_NUMBERS
 from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.noise_level import prior_noise
 from boomdp_jax.inference.posterior import Posterior
@@ -217,7 +219,23 @@ def _merge(
         density=on_device(density, dtype),
         **{kind: build(kind) for kind in fields},
     )
+    params = with_numbers(params, _merge_numbers(blocks, parts, shape))
     return params, inferred
+
+
+def _merge_numbers(
+    blocks: list[Block], parts: list[Params], shape: tuple[int, int]
+) -> dict[str, Any]:
+    """Numbers of the scene's bodies, those that a block infers."""
+    numbers = {}
+    for name, count in BODY_NUMBERS.items():
+        whole = np.full((*shape, count) if count > 1 else shape, UNASKED[name])
+        found = [get_number(part, name) for part in parts]
+        for block, values in zip(blocks, found, strict=True):
+            if values is not None:
+                whole[:, np.asarray(block.bodies)] = np.asarray(values)
+                numbers[name] = whole
+    return {name: on_device(whole) for name, whole in numbers.items()}
 
 
 def _merge_noise(

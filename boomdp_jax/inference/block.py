@@ -66,13 +66,15 @@ def make_block(
     coordinates = Coordinates(
         layout=layout,
         scales=prior_scales(options),
-        surroundings=surroundings(spec, bodies, layout, poses),
+        surroundings=surroundings(
+            spec, bodies, layout, poses, _forces(history, bodies)
+        ),
         scene=_block_scene(spec.scene, bodies),
     )
     if is_uniform is None:
         dt = np.asarray(history.dt)[np.asarray(history.mask)]
         is_uniform = bool(dt.size == 0 or np.all(dt == dt[0]))
-    data = track_data(history, bodies, is_uniform)
+    data = track_data(history, bodies, is_uniform, has_delay=layout.has_delay)
     if weight is not None:
         data = dataclasses.replace(data, weight=on_device(weight))
     scale = np.asarray(coordinates.scales.noise)
@@ -114,6 +116,12 @@ def _poses(history: History, bodies: tuple[int, ...]) -> np.ndarray:
             np.where(seen & np.asarray(history.mask)[:, None, None], values, np.nan)
         )
     return np.concatenate(out)
+
+
+def _forces(history: History, bodies: tuple[int, ...]) -> np.ndarray:
+    """Commanded forces of the rows in use, `[row, body, 2]`."""
+    rows = np.asarray(history.mask)
+    return np.asarray(history.action, float)[rows][:, list(bodies), :2]
 
 
 def _block_scene(scene: Scene, bodies: tuple[int, ...]) -> Scene:

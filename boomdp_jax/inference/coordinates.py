@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import on_device
+from boomdp_jax.inference.body_numbers import numbers_of, with_numbers
 from boomdp_jax.inference.layout import Layout, SlotKey
 from boomdp_jax.inference.prior import PriorScales
 from boomdp_jax.inference.resting import rest_numbers, rest_pose
@@ -51,6 +52,11 @@ class Surroundings(eqx.Module):
     """Mean of the observed positions [m]."""
     spread: Float[Array, " body"]
     """How far from it the positions lie [m]."""
+    centroid: Float[Array, "body 2"]
+    """Where the centre of mass should be, in the frame of the body's pose [m]."""
+    push: Float[Array, " body"]
+    """Root mean square of the forces that were commanded, one where there were none
+    [N]."""
     rest: Float[Array, "rest 4"]
     """Pose of `Layout.rests` and the way they moved most; see `rest_pose`."""
     density: Float[Array, " body"]
@@ -60,7 +66,11 @@ class Surroundings(eqx.Module):
 
 
 def surroundings(
-    spec: SceneSpec, bodies: tuple[int, ...], layout: Layout, poses: np.ndarray
+    spec: SceneSpec,
+    bodies: tuple[int, ...],
+    layout: Layout,
+    poses: np.ndarray,
+    forces: np.ndarray,
 ) -> Surroundings:
     """Measure what the prior needs to know of a block.
 
@@ -69,6 +79,7 @@ def surroundings(
         bodies: indices of the block's bodies in the scene.
         layout: its slots.
         poses: observed poses `[reading, body, 3]` [m, m, rad]; NaN where missing.
+        forces: commanded, `[row, body, 2]` [N].
 
     Returns:
         The sizes, on the default float type.
@@ -98,6 +109,7 @@ def surroundings(
         }
         for slot in layout.known_slots
     }
+    square = np.sum(forces**2, axis=(0, 2)) / max(len(forces), 1)
     authored = (spec.bodies[i].pose for i in bodies)
     start = np.array([np.zeros(3) if pose is None else pose for pose in authored])
     rest = [rest_pose(slot, poses, start) for slot in layout.rests]
@@ -107,6 +119,13 @@ def surroundings(
         box_center=on_device((highs + lows) / 2),
         center=on_device(np.stack(centers)),
         spread=on_device(spreads),
+        centroid=on_device(
+            [
+                body.moments.centroid if body.is_center_unknown else np.zeros(2)
+                for body in (spec.bodies[i] for i in bodies)
+            ]
+        ),
+        push=on_device(np.sqrt(np.where(square > 0, square, 1.0))),
         rest=on_device(np.reshape(rest, (-1, 4))),
         density=on_device(
             [
@@ -217,7 +236,7 @@ class Coordinates(eqx.Module):
                 numbers[key] = jnp.where(jnp.isnan(value), numbers[key], value)
             made[_place(slot)] = numbers
         has = {slot.kind for slot in self.layout.rests}
-        return Params(
+        params = Params(
             density=density,
             revolute=Revolute(**self._joint_arrays("revolute", made)),
             distance=Distance(**self._joint_arrays("distance", made)),
@@ -228,6 +247,8 @@ class Coordinates(eqx.Module):
             else None,
             weld=Weld(**self._joint_arrays("weld", made)) if "weld" in has else None,
         )
+        numbers = numbers_of(z, self.layout, self.scales, around, self.scene.gyration)
+        return with_numbers(params, numbers) if numbers else params
 
     def _scaled(self, name: str, z):
         return self.scales.center[name] + self.scales.spread[name] * z

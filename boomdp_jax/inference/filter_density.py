@@ -17,7 +17,7 @@ from boomdp_jax.inference.kalman import (
     kick_scale,
     start_scale,
 )
-from boomdp_jax.inference.track_data import TrackData
+from boomdp_jax.inference.track_data import TrackData, with_delay
 from boomdp_jax.inference.tracking import channel_difference, predictor
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
@@ -37,6 +37,7 @@ def filter_density(
     Returns:
         The same as `extended_filter` gives. To be batched by `jax.vmap`.
     """
+    data = with_delay(params, data)
     steps = data.steps
     predict = predictor(scene, params, steps.dt)
     num_bodies = steps.state.shape[1]

@@ -222,12 +222,6 @@ def check_history(spec: SceneSpec, history: History) -> None:
             f"{spec.source}: history: expected {spec.num_bodies} bodies, got "
             f"{history.num_bodies}"
         )
-    for body in spec.bodies:
-        if body.is_center_unknown and not body.is_static:
-            raise ValueError(
-                f"{spec.source}: body {body.name!r}: center_of_mass: expected a known "
-                "one; inferring it is not supported yet"
-            )
 
 
 def padded_histories(histories: Sequence[History]) -> list[History]:

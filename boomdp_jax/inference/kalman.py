@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar
-from boomdp_jax.inference.track_data import TrackData, TrackRow
+from boomdp_jax.inference.track_data import TrackData, TrackRow, with_delay
 from boomdp_jax.inference.tracking import Gains, channel_difference, predictor
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
@@ -182,6 +182,7 @@ def extended_filter(
         row's as often as the row counts.
     """
     row_filter = RowFilter(scene, params, data.steps.dt, noise)
+    data = with_delay(params, data)
 
     def advance(carry, row):
         estimate, total = carry

@@ -227,8 +227,13 @@ def _refuse_ties(spec: SceneSpec) -> None:
                 f"{spec.source}: body {spec.names[a]!r}: expected bodies that are not "
                 f"tied to each other; got a {constraint.kind} to {spec.names[b]!r}"
             )
-    for body in spec.bodies:
-        if body.is_center_unknown and not body.is_static:
+    for name in spec.unknown_numbers - {"center_of_mass"}:
+        raise ValueError(
+            f"{spec.source}: unknown: {name}: inferring it together with kinds is not "
+            "supported yet"
+        )
+    for body, is_unknown in zip(spec.bodies, spec.is_center_unknown, strict=True):
+        if is_unknown:
             raise ValueError(
                 f"{spec.source}: body {body.name!r}: center_of_mass: expected a known "
                 "one; inferring it is not supported yet"

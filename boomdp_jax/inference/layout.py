@@ -29,6 +29,25 @@ wheel's heading, a drawer's axis."""
 _MAX_STRUCTURES = 4096
 
 
+BODY_NUMBERS = {
+    "center_of_mass": 2,
+    "actuator.gain": 1,
+    "actuator.bias": 3,
+    "actuator.delay": 1,
+}
+"""Coordinates of what may be inferred of a body besides its density; a name is the way
+to it in `Params`."""
+
+
+class BodyNumber(NamedTuple):
+    """What is inferred of a body besides its density."""
+
+    name: str
+    body: int
+    start: int
+    """First coordinate."""
+
+
 class SlotKey(NamedTuple):
     """One place in `Params` that a constraint may take."""
 
@@ -46,7 +65,7 @@ class SlotKey(NamedTuple):
 class Layout(NamedTuple):
     """Slots and coordinates of a block; static, so that equal blocks share a program.
 
-    Coordinates: the log-density of each body, then those of each slot.
+    Coordinates: the log-density of each body, those of each slot, then the rest.
     """
 
     num_bodies: int
@@ -55,6 +74,7 @@ class Layout(NamedTuple):
     known_slots: tuple[SlotKey, ...]
     """Slots of constraints that are known to exist."""
     dim: int
+    numbers: tuple[BodyNumber, ...] = ()
 
     def count(self, kind: str) -> int:
         """How many slots of a kind `Params` needs (per body for wheel and ground)."""
@@ -75,6 +95,11 @@ class Layout(NamedTuple):
             if slot.kind in DIRECTION:
                 out[slot.start + DIRECTION[slot.kind]] = math.pi
         return out
+
+    @property
+    def has_delay(self) -> bool:
+        """Whether commands take effect later than they were given."""
+        return any(number.name == "actuator.delay" for number in self.numbers)
 
     @property
     def rests(self) -> tuple[SlotKey, ...]:
@@ -129,7 +154,16 @@ def block_layout(spec: SceneSpec, bodies: tuple[int, ...]) -> Layout:
         if spec.unknown.get(kind, 0):
             for i, j in itertools.combinations(movable, 2):
                 add(inferred, kind, i, j, -1)
-    return Layout(len(bodies), tuple(inferred), tuple(known), start)
+    numbers = []
+    for i in movable:
+        for name, count in BODY_NUMBERS.items():
+            is_unknown = name in spec.unknown_numbers
+            if name == "center_of_mass":
+                is_unknown = bool(spec.is_center_unknown[bodies[i]])
+            if is_unknown:
+                numbers.append(BodyNumber(name, i, start))
+                start += count
+    return Layout(len(bodies), tuple(inferred), tuple(known), start, tuple(numbers))
 
 
 def _refuse_drives(spec: SceneSpec) -> None:

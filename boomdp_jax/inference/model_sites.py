@@ -17,7 +17,8 @@ from jaxtyping import Array, Float
 from numpyro.distributions import constraints, transforms
 
 from boomdp_jax.inference.block import Block
-from boomdp_jax.inference.layout import SlotKey
+from boomdp_jax.inference.body_numbers import number_scale
+from boomdp_jax.inference.layout import BODY_NUMBERS, BodyNumber, SlotKey
 from boomdp_jax.inference.prior import LOGARITHMIC
 from boomdp_jax.inference.slot_names import slot_names
 from boomdp_jax.physics.params import WORLD
@@ -165,6 +166,10 @@ def block_sites(block: Block, names: tuple[str, ...]) -> tuple[Site, ...]:
         )
         for index, name in enumerate(names)
     ]
+    sites += [
+        _body_site(number, names[number.body], likelihood.coordinates)
+        for number in block.layout.numbers
+    ]
     for slot, name in slot_names(names, block.layout).items():
         sites += _slot_sites(slot, name, likelihood.coordinates)
     kept = []
@@ -184,6 +189,24 @@ def block_sites(block: Block, names: tuple[str, ...]) -> tuple[Site, ...]:
                 for place in free
             ]
     return tuple(kept)
+
+
+def _body_site(number: BodyNumber, name: str, coordinates: Any) -> Site:
+    """Site of what is inferred of a body besides its density."""
+    count = BODY_NUMBERS[number.name]
+    center = coordinates.scales.center[number.name]
+    spread = coordinates.scales.spread[number.name]
+    origin, unit = number_scale(
+        number, coordinates.surroundings, coordinates.scene.gyration
+    )
+    loc, scale = origin + unit * center, unit * spread
+    return Site(
+        f"{name}.{number.name}",
+        tuple(range(number.start, number.start + count)),
+        "log" if number.name in LOGARITHMIC else "identity",
+        loc if count > 1 else loc[0],
+        scale if count > 1 else scale[0],
+    )
 
 
 def _slot_sites(slot: SlotKey, name: str, coordinates: Any) -> list[Site]:

@@ -28,7 +28,7 @@ from boomdp_jax.core.history import History
 from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.fixed_structure import Structure, structure_blocks
 from boomdp_jax.inference.model_sites import Site, block_sites
-from boomdp_jax.inference.one_step import NOISE_SHAPE, Readings, readings
+from boomdp_jax.inference.one_step import NOISE_SHAPE, Readings, in_effect, readings
 from boomdp_jax.inference.prior import NOISE_GROUPS
 from boomdp_jax.inference.slot_names import known_numbers, physical_numbers
 from boomdp_jax.physics.params import Params
@@ -45,6 +45,8 @@ class ObjectModel(eqx.Module):
     """A NumPyro model of the bodies of a scene that can move; made by `make_model`.
 
     Sample sites, by body and constraint: `table.density` [kg/m²];
+    `table.center_of_mass` [m], `table.actuator.gain`, `bias` [N, N, N m] and `delay`
+    [s] where they are unknown;
     `table.revolute.anchor_a`, `anchor_b` [m], `viscous_rate` [1/s], `dry_share`;
     `table.distance.length` [m]; `table.prismatic.axis` [rad] (to be read modulo half a
     turn), `offset` of the line from where the body was seen [m], `angle` [rad],
@@ -159,7 +161,8 @@ class ObjectModel(eqx.Module):
         if history is None:
             likelihood: Any = block.target.log_likelihood
             return likelihood.data.steps
-        return readings(history, block.bodies, is_uniform=False)
+        has_delay = block.layout.has_delay
+        return readings(history, block.bodies, is_uniform=False, has_delay=has_delay)
 
 
 def make_model(
@@ -246,7 +249,7 @@ def _predict(
         return step(scene, params, state_from_array(state), action, dt=dt)[0].array
 
     in_axes = (0, 0, 0 if data.dt.ndim else None)
-    return jax.vmap(one, in_axes)(data.state, data.action, data.dt)
+    return jax.vmap(one, in_axes)(data.state, in_effect(params, data), data.dt)
 
 
 def _nearest_turn(

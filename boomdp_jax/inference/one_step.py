@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float
 from boomdp_jax.core.arrays import FloatScalar, Key, on_device
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.coordinates import Coordinates
+from boomdp_jax.physics.actuator import Commands, delayed, past_commands
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import state_from_array
@@ -45,15 +46,29 @@ class Readings(eqx.Module):
     """One where a residual counts."""
     dt: Float[Array, " time"] | Float[Array, ""]
     """Scalar where all steps are equally long, which is cheaper."""
+    commands: Commands | None = None
+    """With those from before each step; None: they take effect at once."""
 
 
-def readings(history: History, bodies: tuple[int, ...], is_uniform: bool) -> Readings:
+def in_effect(params: Params, data: Readings) -> Float[Array, "time body 3"]:
+    """Commands that are in effect in each step."""
+    return data.action if data.commands is None else delayed(params, data.commands)
+
+
+def readings(
+    history: History,
+    bodies: tuple[int, ...],
+    is_uniform: bool,
+    *,
+    has_delay: bool = False,
+) -> Readings:
     """Take a block's bodies out of a history.
 
     Args:
         history: all of it.
         bodies: indices of the block's bodies.
         is_uniform: whether all steps are equally long.
+        has_delay: whether commands may take effect later than they were given.
 
     Returns:
         Readings; a row whose first reading is incomplete does not count.
@@ -67,12 +82,17 @@ def readings(history: History, bodies: tuple[int, ...], is_uniform: bool) -> Rea
     counts = pick(history.next_state_mask) & is_whole
     counts &= np.asarray(history.mask)[:, None, None]
     dt = np.asarray(history.dt)
+    commands = None
+    if has_delay:
+        is_start = np.diff(np.asarray(history.episode), prepend=np.nan) != 0
+        commands = past_commands(pick(history.action), dt, is_start)
     return Readings(
         state=on_device(pick(history.state), dtype),
         action=on_device(pick(history.action), dtype),
         next_state=on_device(pick(history.next_state), dtype),
         mask=on_device(counts, dtype),
         dt=on_device(dt[0] if is_uniform else dt, dtype),
+        commands=commands,
     )
 
 
@@ -102,7 +122,7 @@ def residuals(
         return step(scene, params, state_from_array(state), action, dt=dt)[0].array
 
     in_axes = (0, 0, 0 if data.dt.ndim else None)
-    predicted = jax.vmap(predict, in_axes)(data.state, data.action, data.dt)
+    predicted = jax.vmap(predict, in_axes)(data.state, in_effect(params, data), data.dt)
     difference = jnp.where(data.mask > 0, predicted - data.next_state, 0.0)
     angle = difference[..., 2]
     turns = jax.lax.stop_gradient(jnp.round(angle / (2.0 * jnp.pi)))

@@ -128,6 +128,11 @@ class OnlineBelief:
             raise ValueError(f"change_rate: expected in (0, 1), got {change_rate}")
         if dt is not None and not (np.isfinite(dt) and dt > 0):
             raise ValueError(f"dt: expected positive seconds, got {dt}")
+        if "actuator.delay" in spec.unknown_numbers:
+            raise ValueError(
+                f"{spec.source}: unknown.actuator: expected no delay in an online "
+                "belief, which keeps no commands from before a step; got one"
+            )
         self.spec, self.capacity = spec, capacity
         self._dt = float(spec.dt if dt is None else dt)
         self._settings = RefitSettings(

@@ -15,6 +15,8 @@ from jaxtyping import Array, Float, Int
 
 from boomdp_jax.core.arrays import FloatScalar, Key
 from boomdp_jax.core.history import History
+from boomdp_jax.inference.body_numbers import get_number
+from boomdp_jax.inference.layout import BODY_NUMBERS
 from boomdp_jax.inference.posterior_file import (
     read_posterior_file,
     write_posterior_file,
@@ -149,6 +151,11 @@ class Posterior(eqx.Module):
                 np.asarray(params.density),
                 weights,
                 np.asarray(prior.density),
+                {
+                    name: (get_number(params, name), get_number(prior, name))
+                    for name in BODY_NUMBERS
+                    if get_number(params, name) is not None
+                },
             ),
             "structure": report_structures(
                 self.spec, params, weights, prior, self.inferred
@@ -238,7 +245,8 @@ class Posterior(eqx.Module):
         Φ, σ ~ P(·|h); the state is stepped under Φ, after an impulse where the motion
         has noise of its own; noise of scale σ is added. Every call draws a new
         hypothesis; a planner that keeps one down its tree takes it from
-        `sample_params`.
+        `sample_params`. Where commands have a delay, the wrench is the command that is
+        in effect (`delayed_wrenches`).
 
         Args:
             key: random key.

@@ -11,6 +11,8 @@ import numpy as np
 
 from boomdp_jax.core.json_header import read_json_header
 from boomdp_jax.core.npz_file import read_npz, write_npz
+from boomdp_jax.inference.body_numbers import get_number, with_numbers
+from boomdp_jax.inference.layout import BODY_NUMBERS
 from boomdp_jax.physics.params import (
     Distance,
     Ground,
@@ -35,6 +37,12 @@ _GROUPS = {
 }
 _OPTIONAL = ("prismatic", "weld")
 """Groups that a file may do without: scenes may, and those of earlier versions did."""
+
+_BODY_NUMBERS = {
+    name: ("body", count) if count > 1 else ("body",)
+    for name, count in BODY_NUMBERS.items()
+}
+"""Numbers of bodies that are there where they are inferred."""
 
 _KINDS = {"active": "b", "body_a": "i", "body_b": "i", "chain": "i"}
 """Kind of an array by the last part of its name; all others hold floats."""
@@ -145,6 +153,10 @@ def read_posterior_file(
 def _flatten(prefix: str, params: Params) -> dict[str, np.ndarray]:
     """Arrays of params by dotted name; nuisances that are None are left out."""
     arrays = {f"{prefix}.density": np.asarray(params.density)}
+    for name in _BODY_NUMBERS:
+        value = get_number(params, name)
+        if value is not None:
+            arrays[f"{prefix}.{name}"] = np.asarray(value)
     for group in _GROUPS:
         module = getattr(params, group)
         if module is None:
@@ -169,7 +181,13 @@ def _unflatten(prefix: str, arrays: Mapping[str, np.ndarray]) -> Params:
             array = arrays.get(f"{prefix}.{group}.{name}")
             numbers[name] = None if array is None else jnp.asarray(array)
         groups[group] = module(**numbers)
-    return Params(density=jnp.asarray(arrays[f"{prefix}.density"]), **groups)
+    params = Params(density=jnp.asarray(arrays[f"{prefix}.density"]), **groups)
+    numbers = {
+        name: jnp.asarray(arrays[f"{prefix}.{name}"])
+        for name in _BODY_NUMBERS
+        if f"{prefix}.{name}" in arrays
+    }
+    return with_numbers(params, numbers)
 
 
 def _has(group: str, arrays: Mapping[str, np.ndarray]) -> bool:
@@ -187,6 +205,9 @@ def _expected_shapes(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple]:
     }
     for prefix, draw in (("params", "draw"), ("prior_params", "prior draw")):
         shapes[f"{prefix}.density"] = (draw, *_PARAM_SHAPES["density"])
+        for name, axes in _BODY_NUMBERS.items():
+            if any(f"{each}.{name}" in arrays for each in ("params", "prior_params")):
+                shapes[f"{prefix}.{name}"] = (draw, *axes)
         for group, module in _GROUPS.items():
             if not _has(group, arrays):
                 continue

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import jax
 import numpy as np
 
+from boomdp_jax.inference.prior import LOGARITHMIC
 from boomdp_jax.inference.structure_report import (
     group_by_structure,
     report_slots,
@@ -36,6 +37,12 @@ _TITLES = {
     "viscous": "viscous friction",
     "dry": "dry friction limit",
 }
+_BODY_TITLES = {
+    "center_of_mass": ("centre of mass", ["m", "m"]),
+    "actuator.gain": ("actuator gain", [""]),
+    "actuator.bias": ("actuator bias", ["N", "N", "N m"]),
+    "actuator.delay": ("actuator delay", ["s"]),
+}
 _NOISE_UNITS = dict(
     zip(
         (*CHANNELS, *IMPULSES),
@@ -52,16 +59,20 @@ def report_bodies(
     density: np.ndarray,
     weights: np.ndarray,
     prior_density: np.ndarray,
+    numbers: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> dict:
     """Density [kg/m²] and mass [kg] of every body that can move, by name.
 
-    A density that the scene file gives counts as identified.
+    A density that the scene file gives counts as identified. `numbers` are told beside
+    them, a centre of mass in the frame of the outline as authored [m].
 
     Args:
         spec: the scene.
         density: draws, `[draw, body]`.
         weights: of the draws, sum to one, `[draw]`.
         prior_density: prior draws, `[draw, body]`.
+        numbers: by name of `BODY_NUMBERS`, draws and prior draws of what else is
+            inferred, `[draw, body, ...]`.
 
     Returns:
         Marginal summaries over structure, and `identified`, which is the mass's.
@@ -80,6 +91,16 @@ def report_bodies(
             "mass": mass,
             "identified": mass["identified"],
         }
+        for name, (draws, prior_draws) in (numbers or {}).items():
+            if np.all(prior_draws[:, index] == prior_draws[0, index]):
+                continue
+            shift = body.shift if name == "center_of_mass" else 0.0
+            report[body.name][name] = summarise(
+                draws[:, index] + shift,
+                weights,
+                prior_draws[:, index] + shift,
+                "log" if name in LOGARITHMIC else "identity",
+            )
     return report
 
 
@@ -217,6 +238,10 @@ def format_report(report: dict, structures: dict[str, float], num_draws: int) ->
             f"{name:<16}{_interval(body['mass']):<32}{_interval(body['density']):<32}"
             f"{'yes' if body['identified'] else 'no: the prior'}"
         )
+    for name, body in report["bodies"].items():
+        for key, (title, units) in _BODY_TITLES.items():
+            if key in body:
+                lines.append(f"{name:<16}{title:<20}{_quantity(body[key], units)}")
     lines += ["", f"{'structure':<48}probability"]
     for name, probability in structures.items():
         if probability >= _LEAST_SHOWN:

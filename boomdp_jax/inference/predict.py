@@ -21,6 +21,7 @@ from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.random_motion import add_impulse, add_reading_noise
 from boomdp_jax.inference.summary import CHANNELS, plain
 from boomdp_jax.physics import Params, Scene, rollout, state_from_array, step
+from boomdp_jax.physics.actuator import delayed, past_commands
 
 SCHEMA = "boomdp-predict-1"
 
@@ -83,6 +84,7 @@ def predict(
         kept.noise_scale,
         kept.impulse_scale,
         history,
+        _in_effect(kept.params, history),
         tuple(horizons),
     )
     moments = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), moments)
@@ -167,6 +169,7 @@ def _predict_rows(
     noise_scale: Float[Array, "draw body 4"],
     impulse_scale: Float[Array, "draw body 2"] | None,
     history: History,
+    actions: Float[Array, "draw time body 3"] | None,
     horizons: tuple[int, ...],
 ) -> dict[str, Float[Array, "time horizon body 6"]]:
     """Moments and interval of the predictive distribution from every row.
@@ -193,7 +196,9 @@ def _predict_rows(
             jax.tree.map(lambda leaf: leaf[draw], params),
             noise_scale[draw],
             history.state[row],
-            history.action[following],
+            history.action[following]
+            if actions is None
+            else actions[draw[:, None], following],
             history.dt[following],
             places,
             None if impulse_scale is None else impulse_scale[draw],
@@ -212,6 +217,18 @@ def _predict_rows(
     return jax.tree.map(
         lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:num_rows], moments
     )
+
+
+def _in_effect(
+    params: Params, history: History
+) -> Float[Array, "draw time body 3"] | None:
+    """Commands as they take effect by each draw; None: at once."""
+    if params.actuator is None or params.actuator.delay is None:
+        return None
+    table = jax.tree.map(np.asarray, history)
+    is_start = np.diff(table.episode, prepend=np.nan) != 0
+    commands = past_commands(table.action, table.dt, is_start)
+    return jax.lax.map(lambda one: delayed(one, commands), params)
 
 
 def constant_velocity(

@@ -59,11 +59,22 @@ DEFAULT_SCALES: dict[str, Scale] = {
     # Share of decoupled torque: logit-normal. Load shift in radii: normal.
     "ground.torque_share": Scale(-1.0, 1.5),
     "ground.load_shift": Scale(0.0, 0.1),
+    # How far it is from the centroid (or where the scene file says it should be), in
+    # units of the outline's radius of gyration: normal.
+    "center_of_mass": Scale(0.0, 0.3),
+    # Wrench applied over wrench commanded: log-normal. A wrench besides, in units of
+    # the root mean square of commanded forces (that times the radius of gyration for a
+    # torque): normal. Delay [s]: log-normal.
+    "actuator.gain": Scale(1.0, 0.3),
+    "actuator.bias": Scale(0.0, 0.2),
+    "actuator.delay": Scale(0.02, 1.0),
 }
 """Centre and spread of every quantity that is inferred."""
 
 LOGARITHMIC = frozenset(
     {
+        "actuator.gain",
+        "actuator.delay",
         "density",
         "revolute.viscous_rate",
         "revolute.dry_share",

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.inference.coordinates import Coordinates
-from boomdp_jax.inference.layout import SlotKey
+from boomdp_jax.inference.layout import BODY_NUMBERS, SlotKey
 from boomdp_jax.inference.one_step import Readings
 from boomdp_jax.inference.prior import PriorScales
 from boomdp_jax.physics.params import WORLD
@@ -119,6 +119,10 @@ def seed_coordinates(
         else:
             continue
         z = z.at[where].set(values)
+        has = has.at[where].set(True)
+    for number in layout.numbers:
+        # Where the prior has it: nothing is known better without a fit.
+        where = slice(number.start, number.start + BODY_NUMBERS[number.name])
         has = has.at[where].set(True)
     return jnp.clip(z, -6.0, 6.0), has
 

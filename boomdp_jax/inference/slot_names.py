@@ -5,6 +5,7 @@ import collections
 import numpy as np
 from jaxtyping import Array, Float
 
+from boomdp_jax.inference.body_numbers import get_number
 from boomdp_jax.inference.layout import Layout, SlotKey
 from boomdp_jax.physics.constraint_spec import JOINTS
 from boomdp_jax.physics.params import WORLD, Params
@@ -52,13 +53,17 @@ def physical_numbers(
         area: of the bodies' outlines [m²].
 
     Returns:
-        Density [kg/m²] and mass [kg] of each body, and the numbers of each slot, in
-        the units of `physics.params`; zero where a slot is not active.
+        Density [kg/m²] and mass [kg] of each body, what else is inferred of it, and the
+        numbers of each slot, in the units of `physics.params`; zero where a slot is not
+        active.
     """
     numbers = {}
     for index, name in enumerate(names):
         numbers[f"{name}.density"] = params.density[index]
         numbers[f"{name}.mass"] = params.density[index] * area[index]
+    for number in layout.numbers:
+        value = get_number(params, number.name)[number.body]
+        numbers[f"{names[number.body]}.{number.name}"] = value
     for slot, name in slot_names(names, layout).items():
         group = getattr(params, slot.kind)
         is_joint = slot.kind in JOINTS

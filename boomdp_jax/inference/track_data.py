@@ -8,7 +8,8 @@ from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import on_device
 from boomdp_jax.core.history import History
-from boomdp_jax.inference.one_step import Readings, readings
+from boomdp_jax.inference.one_step import Readings, in_effect, readings
+from boomdp_jax.physics.params import Params
 
 
 class TrackRow(NamedTuple):
@@ -66,8 +67,19 @@ class TrackData(eqx.Module):
         )
 
 
+def with_delay(params: Params, data: TrackData) -> TrackData:
+    """The same with the commands that a hypothesis has in effect in each row."""
+    if data.steps.commands is None:
+        return data
+    return eqx.tree_at(lambda d: d.steps.action, data, in_effect(params, data.steps))
+
+
 def track_data(
-    history: History, bodies: tuple[int, ...], is_uniform: bool
+    history: History,
+    bodies: tuple[int, ...],
+    is_uniform: bool,
+    *,
+    has_delay: bool = False,
 ) -> TrackData:
     """Take a block's bodies out of a history.
 
@@ -75,13 +87,14 @@ def track_data(
         history: all of it.
         bodies: indices of the block's bodies.
         is_uniform: whether all steps are equally long.
+        has_delay: whether commands may take effect later than they were given.
 
     Returns:
         The readings. A missing first reading of a track is replaced by the mean
         position, or by rest; how little is known of it is up to the filter.
     """
     index = np.asarray(bodies)
-    steps = readings(history, bodies, is_uniform)
+    steps = readings(history, bodies, is_uniform, has_delay=has_delay)
     dtype = steps.state.dtype
     state, rows = np.asarray(steps.state), np.asarray(history.mask)
     first = np.asarray(history.state_mask)[:, index] & rows[:, None, None]

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar, on_device
-from boomdp_jax.inference.track_data import TrackData, TrackRow
+from boomdp_jax.inference.track_data import TrackData, TrackRow, with_delay
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import state_from_array
@@ -146,6 +146,7 @@ def innovations(
         independent and of unit variance if hypothesis, gains and noise are right.
     """
     predict = predictor(scene, params, data.steps.dt)
+    data = with_delay(params, data)
 
     def advance(state, inputs):
         return track_row(predict, state, *inputs)

@@ -7,9 +7,12 @@ from typing import Any
 import jax
 import numpy as np
 
+from boomdp_jax.inference.body_numbers import get_number
+from boomdp_jax.inference.layout import BODY_NUMBERS
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.summary import CHANNELS
 from boomdp_jax.physics.constraint_spec import JOINTS, KINDS
+from boomdp_jax.physics.params import Params
 
 _SUFFIX_DIMS = {
     "anchor_a": ("axis",),
@@ -19,6 +22,8 @@ _SUFFIX_DIMS = {
     "wheel_viscous": ("direction",),
     "wheel_dry": ("direction",),
 }
+
+_BODY_DIMS = {"center_of_mass": ("axis",), "actuator.bias": ("wrench",)}
 
 
 def to_arviz(posterior: Posterior) -> Any:
@@ -87,7 +92,7 @@ def _num_chains(chain: np.ndarray) -> int:
 
 
 def _variables(
-    posterior: Posterior, params: object, noise: dict
+    posterior: Posterior, params: Params, noise: dict
 ) -> tuple[dict[str, np.ndarray], dict[str, list[str]]]:
     """Arrays by name, leading axis draw, and the names of their other axes."""
     params = jax.tree.map(np.asarray, params)
@@ -102,6 +107,12 @@ def _variables(
         "mass": ["body"],
         "noise_scale": ["body", "channel"],
     }
+    for key in BODY_NUMBERS:
+        value = get_number(params, key)
+        if value is not None:
+            name = key.replace(".", "_")
+            numbers[name] = value
+            dims[name] = ["body", *_BODY_DIMS.get(key, ())]
     if "impulse_scale" in numbers:
         dims["impulse_scale"] = ["body", "impulse"]
     slot_dims = {
@@ -136,6 +147,7 @@ def _coordinates(posterior: Posterior) -> dict[str, list]:
         "channel": list(CHANNELS),
         "impulse": ["velocity", "spin"],
         "axis": ["x", "y"],
+        "wrench": ["force_x", "force_y", "torque"],
         "direction": ["rolling", "lateral"],
         **{
             kind: list(range(getattr(params, kind).active.shape[-1]))

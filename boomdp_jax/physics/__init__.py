@@ -1,5 +1,6 @@
 """A pure-JAX planar rigid-body engine whose stiff parts are solved implicitly."""
 
+from boomdp_jax.physics.actuator import delayed_wrenches as delayed_wrenches
 from boomdp_jax.physics.events import FirstTime as FirstTime
 from boomdp_jax.physics.events import contact_flags as contact_flags
 from boomdp_jax.physics.events import fell_over as fell_over
@@ -7,6 +8,7 @@ from boomdp_jax.physics.events import first_contact as first_contact
 from boomdp_jax.physics.events import first_time as first_time
 from boomdp_jax.physics.events import reached_region as reached_region
 from boomdp_jax.physics.params import WORLD as WORLD
+from boomdp_jax.physics.params import Actuator as Actuator
 from boomdp_jax.physics.params import Distance as Distance
 from boomdp_jax.physics.params import Ground as Ground
 from boomdp_jax.physics.params import Params as Params
@@ -43,6 +45,7 @@ from boomdp_jax.physics.world_rollout import empty_cache as empty_cache
 
 __all__ = [
     "WORLD",
+    "Actuator",
     "Distance",
     "FirstTime",
     "Ground",
@@ -60,6 +63,7 @@ __all__ = [
     "angular_momentum",
     "constraint_error",
     "contact_flags",
+    "delayed_wrenches",
     "empty_cache",
     "empty_params",
     "fell_over",

@@ -124,6 +124,17 @@ class Surface(eqx.Module):
     """Speed after an impact over that before, in [0, 1]."""
 
 
+class Actuator(eqx.Module):
+    """What acts on bodies, given what was commanded; see `actuator`."""
+
+    gain: Float[Array, "*batch body"] | None = None
+    """Wrench applied over wrench commanded; None: one."""
+    bias: Float[Array, "*batch body 3"] | None = None
+    """Wrench applied besides, world frame [N, N, N m]; None: zero."""
+    delay: Float[Array, "*batch body"] | None = None
+    """How much later a command takes effect [s]; None: at once."""
+
+
 class Params(eqx.Module):
     """One hypothesis Φ. Structure is which slots are active; shapes never change."""
 
@@ -137,6 +148,11 @@ class Params(eqx.Module):
     """What contact is like; needed in scenes with contact (`Scene.collides`)."""
     prismatic: Prismatic | None = None
     weld: Weld | None = None
+    center_of_mass: Float[Array, "*batch body 2"] | None = None
+    """Where it lies in the body frame, whose origin is the reference point of states
+    and wrenches [m]; None: there."""
+    actuator: Actuator | None = None
+    """None: what is commanded acts."""
 
 
 def empty_params(

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar
+from boomdp_jax.physics.center_of_mass import state_of_center
 from boomdp_jax.physics.joints import joints_of
 from boomdp_jax.physics.motion import Motion
 from boomdp_jax.physics.params import Params
@@ -47,6 +48,7 @@ def kinetic_energy(scene: Scene, params: Params, state: State) -> FloatScalar:
     Returns:
         The energy [J].
     """
+    state = state_of_center(params, state)
     mass, inertia = mass_and_inertia(scene, params)
     square = jnp.sum(state.twist[:, :2] ** 2, axis=-1)
     return 0.5 * jnp.sum(mass * square + inertia * state.twist[:, 2] ** 2)
@@ -63,6 +65,7 @@ def potential_energy(scene: Scene, params: Params, state: State) -> FloatScalar:
     Returns:
         The energy [J], zero with all centres of mass at the origin of the world.
     """
+    state = state_of_center(params, state)
     mass, _ = mass_and_inertia(scene, params)
     return -jnp.sum(mass * (state.pose[:, :2] @ scene.gravity))
 
@@ -95,6 +98,7 @@ def linear_momentum(scene: Scene, params: Params, state: State) -> Float[Array, 
     Returns:
         The momentum [kg m/s].
     """
+    state = state_of_center(params, state)
     mass, _ = mass_and_inertia(scene, params)
     return mass @ state.twist[:, :2]
 
@@ -119,6 +123,7 @@ def angular_momentum(
     Returns:
         The angular momentum about that point [kg m²/s].
     """
+    state = state_of_center(params, state)
     mass, inertia = mass_and_inertia(scene, params)
     arm_x, arm_y = state.pose[:, 0] - about[0], state.pose[:, 1] - about[1]
     vx, vy, spin = state.twist.T

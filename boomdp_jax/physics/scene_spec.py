@@ -22,10 +22,12 @@ from boomdp_jax.physics.scene_arrays import (
     build_params,
     build_scene,
     build_surface,
+    has_contact,
 )
 from boomdp_jax.physics.scene_fields import (
     check_finite,
     read_count,
+    read_flag,
     read_list,
     read_number,
     read_object,
@@ -39,6 +41,9 @@ SCENE_SCHEMA = "planar-scene-1"
 
 STANDARD_GRAVITY = 9.81
 """Load on floor and wheels of a scene seen from above, if it gives none [m/s²]."""
+
+ACTUATOR_NUMBERS = ("gain", "bias", "delay")
+"""What `unknown.actuator` may list; see `physics.actuator`."""
 
 _MAX_UNKNOWN = 100
 _OPTIONAL_FIELDS = ("gravity", "normal_gravity", "constraints", "unknown", "prior")
@@ -63,6 +68,9 @@ class SceneSpec:
     """What replaces parts of the default prior, as given."""
     source: str
     """Where it comes from, for messages."""
+    unknown_numbers: frozenset[str] = frozenset()
+    """What is to be inferred of every body that can move: `center_of_mass`,
+    `actuator.gain`, `actuator.bias`, `actuator.delay`."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -78,6 +86,17 @@ class SceneSpec:
     def is_static(self) -> Bool[np.ndarray, " body"]:
         """Which bodies never move."""
         return np.array([body.is_static for body in self.bodies], bool)
+
+    @property
+    def is_center_unknown(self) -> Bool[np.ndarray, " body"]:
+        """Of which bodies the centre of mass is to be inferred.
+
+        States, wrenches and anchors of such a body refer to the origin of its outline
+        where the body's own entry has null, else to where the centre of mass would be.
+        """
+        is_any = "center_of_mass" in self.unknown_numbers
+        is_each = np.array([body.is_center_unknown for body in self.bodies], bool)
+        return (is_each | is_any) & ~self.is_static
 
     @property
     def pose(self) -> Float[np.ndarray, "body 3"]:
@@ -194,7 +213,7 @@ class SceneSpec:
                 constraint_to_dict(constraint, self.bodies)
                 for constraint in self.constraints
             ],
-            "unknown": dict(self.unknown),
+            "unknown": dict(self.unknown) | _unknown_to_dict(self.unknown_numbers),
             "prior": json.loads(json.dumps(self.prior)),
         }
 
@@ -232,12 +251,16 @@ def scene_spec_from_dict(content: object, source: str = "scene") -> SceneSpec:
         read_constraint(entry, f"{source}: constraints[{i}]", bodies, normal_gravity)
         for i, entry in enumerate(entries)
     )
-    caps = read_object(fields.get("unknown", {}), f"{source}: unknown", optional=KINDS)
+    caps = read_object(
+        fields.get("unknown", {}),
+        f"{source}: unknown",
+        optional=(*KINDS, "center_of_mass", "actuator"),
+    )
     prior = fields.get("prior", {})
     if not isinstance(prior, dict):
         refuse(f"{source}: prior", "an object", prior)
     check_finite(prior, f"{source}: prior")
-    return SceneSpec(
+    spec = SceneSpec(
         bodies=bodies,
         constraints=constraints,
         gravity=gravity,
@@ -251,7 +274,43 @@ def scene_spec_from_dict(content: object, source: str = "scene") -> SceneSpec:
         },
         prior=prior,
         source=source,
+        unknown_numbers=_read_unknown_numbers(caps, f"{source}: unknown"),
     )
+    _check_centers(spec)
+    return spec
+
+
+def _read_unknown_numbers(caps: dict, where: str) -> frozenset[str]:
+    """Names of numbers of bodies that are to be inferred."""
+    numbers = read_list(caps.get("actuator", []), f"{where}.actuator")
+    for number in numbers:
+        if number not in ACTUATOR_NUMBERS:
+            expected = f"a list of some of {', '.join(ACTUATOR_NUMBERS)}"
+            refuse(f"{where}.actuator", expected, number)
+    names = {f"actuator.{number}" for number in numbers}
+    if read_flag(caps.get("center_of_mass", False), f"{where}.center_of_mass"):
+        names.add("center_of_mass")
+    return frozenset(names)
+
+
+def _unknown_to_dict(names: frozenset[str]) -> dict:
+    """The inverse of `_read_unknown_numbers`."""
+    entry: dict = {}
+    if "center_of_mass" in names:
+        entry["center_of_mass"] = True
+    numbers = [n for n in ACTUATOR_NUMBERS if f"actuator.{n}" in names]
+    return entry | ({"actuator": numbers} if numbers else {})
+
+
+def _check_centers(spec: SceneSpec) -> None:
+    """Contact takes circles to be about their centre of mass."""
+    for body, is_unknown in zip(spec.bodies, spec.is_center_unknown, strict=True):
+        if is_unknown and body.kind == "circle" and has_contact(spec.bodies):
+            refuse(
+                f"{spec.source}: body {body.name!r}: center_of_mass",
+                "the centre of the circle, as the scene has contact (or a polygon)",
+                None,
+            )
 
 
 def _read_bodies(value: object, source: str) -> tuple[BodySpec, ...]:

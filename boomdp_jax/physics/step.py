@@ -44,6 +44,7 @@ speed is. Twice the speed of a resting contact's fall in a substep (0.1 m/s unde
 gravity) is much, a tenth of it little. Restitution keeps its jump.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -51,6 +52,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from boomdp_jax.physics.actuator import applied, without_actuator
+from boomdp_jax.physics.center_of_mass import (
+    about_center,
+    state_of_center,
+    state_of_reference,
+    wrench_at_center,
+)
 from boomdp_jax.physics.lone_body import LoneBody
 from boomdp_jax.physics.lone_rail import Rail, after_step, before_step
 from boomdp_jax.physics.lone_step import lone_step
@@ -61,6 +69,7 @@ from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
 from boomdp_jax.physics.step_info import StepInfo as StepInfo
 from boomdp_jax.physics.world_rollout import (
+    empty_cache,
     prepare_step_of_world,
     world_rollout,
     world_step,
@@ -82,8 +91,10 @@ def step(
         scene: outlines, feet, gravity.
         params: one hypothesis about everything that is not seen.
         state: poses and twists.
-        wrench: forces and torques at the centres of mass, world frame, constant over
-            the step [N, N, N m].
+        wrench: forces and torques at the reference points of the states, which are the
+            centres of mass unless `Params.center_of_mass` says otherwise; world frame,
+            constant over the step [N, N, N m]. Gain and bias of `Params.actuator` are
+            applied to them, its delay has to be before (`delayed_wrenches`).
         dt: length of the step [s]; default: the scene's.
         cache: `StepInfo.cache` of the step before; may be left out.
 
@@ -142,6 +153,13 @@ def rollout(
         The states after each step and their reports, with a leading time axis.
     """
     length = jnp.asarray(scene.dt if dt is None else dt, state.pose.dtype)
+    if params.actuator is not None:
+        wrenches = jax.vmap(lambda wrench: applied(params, wrench, scene.is_static))(
+            wrenches
+        )
+        return rollout(scene, without_actuator(params), state, wrenches, dt=length)
+    if params.center_of_mass is not None:
+        return _rollout_of_reference(scene, params, state, wrenches, length)
     if not is_lone(scene, params):
         return world_rollout(scene, params, state, wrenches, length)
     constant = prepare_lone(scene, params, length) if length.ndim == 0 else None
@@ -162,8 +180,41 @@ def rollout(
     return jax.lax.scan(one_step, motion_of(state), inputs)[1]
 
 
+def _rollout_of_reference(
+    scene: Scene, params: Params, state: State, wrenches: Array, length: Array
+) -> tuple[State, StepInfo]:
+    """The same where centres of mass are elsewhere: torques depend on the pose."""
+    constant = _step_of(scene, params, length) if length.ndim == 0 else None
+
+    def advance(carry, inputs):
+        wrench, now = inputs
+        one_step = _step_of(scene, params, now) if constant is None else constant
+        state, info = one_step(carry[0], wrench, carry[1])
+        report = dataclasses.replace(info, cache=None)
+        return (state, info.cache), (state, report)
+
+    inputs = (wrenches, length if constant is None else None)
+    one_step = jax.checkpoint(advance, prevent_cse=False)
+    return jax.lax.scan(one_step, (state, empty_cache(scene)), inputs)[1]
+
+
 def _step_of(scene: Scene, params: Params, length: Array) -> Callable:
     """A function from state, wrench and cache, with what is constant worked out."""
+    if params.actuator is not None:
+        advance_applied = _step_of(scene, without_actuator(params), length)
+        return lambda state, wrench, cache: advance_applied(
+            state, applied(params, wrench, scene.is_static), cache
+        )
+    if params.center_of_mass is not None:
+        advance_center = _step_of(*about_center(scene, params), length)
+
+        def advance_reference(state: State, wrench, cache: Any):
+            wrench = wrench_at_center(params, state, wrench, length)
+            center = state_of_center(params, state)
+            center, info = advance_center(center, wrench, cache)
+            return state_of_reference(params, center), info
+
+        return advance_reference
     if not is_lone(scene, params):
         world = prepare_step_of_world(scene, params, length)
         return lambda state, wrench, cache: world_step(

@@ -40,8 +40,9 @@ def draw_posterior(
 
     A pin, a rod's end or a weld is a cloud of draws with its 90 % ellipse; a drawer is
     its line, as the body has it where it was seen. A wheel is its axle
-    line, the 90 % band of that line, and an arrow along its heading. All is in the
-    frame of the outline as authored.
+    line, the 90 % band of that line, and an arrow along its heading. A cross is the
+    centre of mass, the mean one where it is inferred. All is in the frame of the
+    outline as authored.
 
     Args:
         ax: a `matplotlib.axes.Axes`.
@@ -51,9 +52,12 @@ def draw_posterior(
             `[x, y]` or `wheel` `[x, y, heading]` in the outline's frame [m, rad].
     """
     spec = posterior.spec.bodies[body]
-    reach = _draw_outline(ax, spec)
     params = jax.tree.map(np.asarray, posterior.params)
     weights = posterior.weights
+    center = spec.shift
+    if params.center_of_mass is not None:
+        center = center + weights @ params.center_of_mass[:, body]
+    reach = _draw_outline(ax, spec, center)
     every = {kind: np.ones_like(slots) for kind, slots in posterior.inferred.items()}
     for slots, probability in _likely(params, every, weights, body):
         rows, draws = constraint_draws(slots, params, every)
@@ -111,7 +115,7 @@ def _likely(
     return sorted(result, key=lambda entry: KINDS.index(entry[0].kind))
 
 
-def _draw_outline(ax: Any, spec: Any) -> float:
+def _draw_outline(ax: Any, spec: Any, center: np.ndarray) -> float:
     """Outline and centre of mass; returns how far the outline reaches [m]."""
     from matplotlib.patches import Circle, Polygon
 
@@ -124,7 +128,7 @@ def _draw_outline(ax: Any, spec: Any) -> float:
     margin = 0.12 * float(np.max(high - low))
     ax.update_datalim(np.array([low - margin, high + margin]))
     ax.autoscale_view()
-    ax.plot(*spec.shift, marker="+", color=EDGE, markersize=7, zorder=2)
+    ax.plot(*center, marker="+", color=EDGE, markersize=7, zorder=2)
     return 0.5 * float(np.max(high - low))
 
 

@@ -94,6 +94,18 @@ def test_a_force_at_a_point_becomes_a_wrench(tmp_path: Path):
     np.testing.assert_allclose(history.action[0, 1], 0.0)
 
 
+def test_a_point_of_nan_is_the_reference_point(tmp_path: Path):
+    rows = _rows(2)
+    rows["state"][:, 0, :2] = [1.0, 1.0]
+    action = np.zeros((2, 2, 3))
+    action[:, 0] = [2.0, 3.0, 0.5]
+    point = np.full((2, 2, 2), np.nan)
+    point[1, 0] = [1.5, 3.0]
+    path = _write(tmp_path / "data.npz", **{**rows, "action": action, "point": point})
+    history = load_history(path, spec=_Scene())
+    np.testing.assert_allclose(history.action[:, 0, 2], [0.5, 0.5 + 1.5 - 4.0])
+
+
 def test_a_force_at_a_point_of_a_body_that_was_not_seen_is_refused(tmp_path: Path):
     rows = _rows()
     rows["state"][3, 0, 0] = np.nan

@@ -295,3 +295,49 @@ def test_a_name_finds_its_body():
     assert spec.index("wall") == 2
     with pytest.raises(ValueError, match=r"expected one of table, .*, got 'chair'"):
         spec.index("chair")
+
+
+def test_all_centres_of_mass_may_be_unknown_about_where_they_would_be():
+    """What does not move has none to infer, and a file with null keeps its origin."""
+    content = _with_null(["bodies", 1, "center_of_mass"])
+    spec = scene_spec_from_dict(content)
+    assert spec.is_center_unknown.tolist() == [False, True, False, False]
+    del content["bodies"][1]["center_of_mass"], content["bodies"][1]["contact"]
+    content["unknown"]["center_of_mass"] = True
+    spec = scene_spec_from_dict(content)
+    assert spec.is_center_unknown.tolist() == [True, True, False, True]
+    np.testing.assert_allclose(spec.bodies[1].shift, [1.0, 0.5])
+    written = json.loads(json.dumps(spec.to_dict()))
+    again = scene_spec_from_dict(written)
+    np.testing.assert_array_equal(again.is_center_unknown, spec.is_center_unknown)
+    assert spec.params().center_of_mass is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"unknown": {"center_of_mass": 1}}, r"unknown\.center_of_mass: expected"),
+        (
+            {"unknown": {"center_of_mass": True}},
+            r"body 'pillar': center_of_mass: expected the centre of the circle",
+        ),
+    ],
+)
+def test_an_unknown_centre_of_mass_that_makes_no_sense_is_refused(
+    changes: dict, message: str
+):
+    with pytest.raises(ValueError, match=message):
+        scene_spec_from_dict({**_scene(), **changes})
+
+
+def test_numbers_of_the_actuator_may_be_unknown():
+    content = {**_scene(), "unknown": {"wheel": 1, "actuator": ["delay", "gain"]}}
+    spec = scene_spec_from_dict(content)
+    assert spec.unknown_numbers == {"actuator.delay", "actuator.gain"}
+    written = json.loads(json.dumps(spec.to_dict()))
+    assert written["unknown"]["actuator"] == ["gain", "delay"]
+    assert scene_spec_from_dict(written).unknown_numbers == spec.unknown_numbers
+    for wrong in ("gain", ["drift"], [1], True):
+        content["unknown"]["actuator"] = wrong
+        with pytest.raises(ValueError, match=r"unknown\.actuator: expected a list"):
+            scene_spec_from_dict(content)
