@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from boomdp_jax.core.arrays import FloatScalar
+from boomdp_jax.inference.contact_prediction import ContactScene
 from boomdp_jax.inference.filter_update import correct, move_and_correct
 from boomdp_jax.inference.kalman import (
     NoiseLevel,
@@ -24,7 +25,10 @@ from boomdp_jax.physics.scene import Scene
 
 
 def filter_density(
-    scene: Scene, params: Params, data: TrackData, noise: NoiseLevel
+    scene: Scene | ContactScene,
+    params: Params,
+    data: TrackData,
+    noise: NoiseLevel,
 ) -> FloatScalar:
     """Log-density of all readings but the first of each track.
 

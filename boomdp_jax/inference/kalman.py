@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar
+from boomdp_jax.inference.contact_prediction import ContactScene
 from boomdp_jax.inference.track_data import TrackData, TrackRow
 from boomdp_jax.inference.tracking import Gains, channel_difference, predictor
 from boomdp_jax.physics.params import Params
@@ -94,7 +95,7 @@ class RowFilter:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Scene | ContactScene,
         params: Params,
         dt: Float[Array, " time"] | Float[Array, ""],
         noise: NoiseLevel,
@@ -167,7 +168,10 @@ class RowFilter:
 
 
 def extended_filter(
-    scene: Scene, params: Params, data: TrackData, noise: NoiseLevel
+    scene: Scene | ContactScene,
+    params: Params,
+    data: TrackData,
+    noise: NoiseLevel,
 ) -> Filtered:
     """Filter all rows at one hypothesis.
 

@@ -46,7 +46,7 @@ class SlotKey(NamedTuple):
 class Layout(NamedTuple):
     """Slots and coordinates of a block; static, so that equal blocks share a program.
 
-    Coordinates: the log-density of each body, then those of each slot.
+    Coordinates: the log-density of each body, then those of each slot, then contact.
     """
 
     num_bodies: int
@@ -55,6 +55,13 @@ class Layout(NamedTuple):
     known_slots: tuple[SlotKey, ...]
     """Slots of constraints that are known to exist."""
     dim: int
+    contact: tuple[str, ...] = ()
+    """Numbers of contact that are inferred, `friction` or `restitution`, whose
+    coordinates are the last ones."""
+
+    def contact_coordinate(self, name: str) -> int:
+        """Which coordinate a number of contact has."""
+        return self.dim - len(self.contact) + self.contact.index(name)
 
     def count(self, kind: str) -> int:
         """How many slots of a kind `Params` needs (per body for wheel and ground)."""
@@ -83,12 +90,15 @@ class Layout(NamedTuple):
         return tuple(slot for slot in slots if slot.kind in NEW_KINDS)
 
 
-def block_layout(spec: SceneSpec, bodies: tuple[int, ...]) -> Layout:
+def block_layout(
+    spec: SceneSpec, bodies: tuple[int, ...], contact: tuple[str, ...] = ()
+) -> Layout:
     """Lay out the constraints that a block of bodies may have.
 
     Args:
         spec: the scene.
         bodies: indices of the block's bodies in the scene, ascending.
+        contact: numbers of contact that are inferred.
 
     Returns:
         The layout; its body indices count within the block.
@@ -129,7 +139,8 @@ def block_layout(spec: SceneSpec, bodies: tuple[int, ...]) -> Layout:
         if spec.unknown.get(kind, 0):
             for i, j in itertools.combinations(movable, 2):
                 add(inferred, kind, i, j, -1)
-    return Layout(len(bodies), tuple(inferred), tuple(known), start)
+    dim = start + len(contact)
+    return Layout(len(bodies), tuple(inferred), tuple(known), dim, contact)
 
 
 def _refuse_drives(spec: SceneSpec) -> None:

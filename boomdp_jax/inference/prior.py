@@ -59,6 +59,10 @@ DEFAULT_SCALES: dict[str, Scale] = {
     # Share of decoupled torque: logit-normal. Load shift in radii: normal.
     "ground.torque_share": Scale(-1.0, 1.5),
     "ground.load_shift": Scale(0.0, 0.1),
+    # Of surfaces that touch, friction log-normal and restitution logit-normal: about
+    # uniform.
+    "contact.friction": Scale(0.3, 0.8),
+    "contact.restitution": Scale(0.0, 1.5),
 }
 """Centre and spread of every quantity that is inferred."""
 
@@ -75,6 +79,7 @@ LOGARITHMIC = frozenset(
         "wheel.half_track",
         "ground.friction",
         "ground.knee_speed",
+        "contact.friction",
     }
 )
 """Quantities that are sampled as logarithms; their centre is a median."""
