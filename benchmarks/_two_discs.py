@@ -21,7 +21,7 @@ import numpy as np
 
 DT = 0.02
 DENSITY_SPREAD, FRICTION, RESTITUTION = 1.5, (0.3, 0.8), (0.0, 1.5)
-"""Of the default prior: log-density; friction, log-normal; restitution, logit-normal."""
+"""Default prior: sd of log-density; friction log-normal, restitution logit-normal."""
 
 
 class Collision(NamedTuple):
@@ -93,7 +93,7 @@ def random_collision(
     Args:
         rng: source of randomness.
         num_readings: every 20 ms.
-        sd: of readings of places [m] and of angles in units of 1 rad a metre of 10 cm.
+        sd: of readings of places [m]; of angles it is five times that [rad].
 
     Returns:
         Truth and readings; they meet about half-way.
@@ -172,20 +172,26 @@ def grid_posterior(collision: Collision) -> GridPosterior:
 
 
 def _on_grid(collision: Collision, low, high, shape) -> GridPosterior:
-    area = np.pi * collision.radius**2
     axes = [np.linspace(a, b, n) for a, b, n in zip(low, high, shape, strict=True)]
     mesh = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     log_ratio, restitution, log_friction = mesh.T
     value = _log_marginal(collision, log_ratio, restitution, np.exp(log_friction))
-    spread = DENSITY_SPREAD * np.sqrt(2.0)
-    value -= 0.5 * ((log_ratio - np.log(area[0] / area[1])) / spread) ** 2
-    logit = np.log(restitution) - np.log1p(-restitution)
-    value -= 0.5 * ((logit - RESTITUTION[0]) / RESTITUTION[1]) ** 2
-    value -= np.log(restitution) + np.log1p(-restitution)
-    value -= 0.5 * ((log_friction - np.log(FRICTION[0])) / FRICTION[1]) ** 2
+    value += log_prior(collision, log_ratio, restitution, log_friction)
     weight = np.exp(value - value.max())
     weight = (weight / weight.sum()).reshape(shape)
     return GridPosterior((axes[0], axes[1], axes[2]), weight)
+
+
+def log_prior(collision: Collision, log_ratio, restitution, log_friction):
+    """Log-density of the default prior over what the grid is of, `[point]`."""
+    area = np.pi * collision.radius**2
+    spread = DENSITY_SPREAD * np.sqrt(2.0)
+    ratio = (log_ratio - np.log(area[0] / area[1])) / spread
+    rub = (log_friction - np.log(FRICTION[0])) / FRICTION[1]
+    logit = np.log(restitution) - np.log1p(-restitution)
+    bounce = (logit - RESTITUTION[0]) / RESTITUTION[1]
+    volume = np.log(restitution) + np.log1p(-restitution)
+    return -0.5 * (ratio**2 + rub**2 + bounce**2) - volume
 
 
 def _log_marginal(collision: Collision, log_ratio, restitution, friction) -> np.ndarray:

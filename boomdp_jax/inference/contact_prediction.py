@@ -9,6 +9,11 @@ contact, and a step is taken in three parts: until just before it, a short one o
 and the rest; pairs that approach do not collide in a part in which they do not touch.
 Impacts that follow another one within a step are no better than the engine's.
 
+Whether bodies have collided at the end of a step depends on a hair's breadth, where they
+go afterwards does not. A filter that compares where neighbours of its estimate go would
+find that it knows nothing of the twists after such a step, so it asks whether the
+estimate itself collides, and treats the neighbours alike (`first_impact`).
+
 Walls are bodies of the engine's scene, but not of the state: nothing reads where they
 are.
 """
@@ -17,7 +22,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import FloatScalar
 from boomdp_jax.inference.first_touch import NEVER, PairSort, touch_times
@@ -34,6 +39,9 @@ NUM_SUBSTEPS = 2
 # bounce: at 1 m/s and 20 ms by 0.04 mm.
 _REACH = 0.002
 _EDGE = 1.5 * _REACH
+# How far from the middle of a step an impact may be to be taken back and forth to, as a
+# share of the step: half of one before it begins or after it ends.
+_MOST_SHIFT = 1.0
 
 
 class ContactScene(eqx.Module):
@@ -82,6 +90,7 @@ def contact_step(
     state: Float[Array, "body 6"],
     action: Float[Array, "body 3"],
     length: FloatScalar,
+    impact: Bool[Array, "all all"] | None = None,
 ) -> Float[Array, "body 6"]:
     """Where a step ends.
 
@@ -91,36 +100,83 @@ def contact_step(
         state: channels of the block's bodies.
         action: wrenches on them, world frame [N, N, N m].
         length: of the step [s].
+        impact: which pair of bodies and walls collides first, whether that is within
+            the step or a little before or after; see `first_impact`, which is the
+            default.
 
     Returns:
         Their channels after it.
     """
-    num_walls, num_bodies = world.num_walls, state.shape[0]
+    begin = _begin(world, params, state, action, length)
+    scene, params, pose, twist, wrench, gain = begin
+    times = _times(world, pose, twist, gain, length)
+    if impact is None:
+        impact = _impact(times, length)
+    has_impact = jnp.any(impact)
+    first = jnp.min(jnp.where(impact, times, NEVER))
+    # A pair that no more than grazes may miss.
+    first = jnp.where(jnp.abs(first / length - 0.5) < _MOST_SHIFT, first, 0.5 * length)
+    cut = jnp.clip(first / length, _EDGE, 1.0 - _EDGE)
+    shift = jnp.where(has_impact, first - cut * length, 0.0)
+    # Pairs that approach are left alone until then.
+    is_lying = (times <= _EDGE * length) & ~impact | (times == NEVER)
+    is_due = (times <= (cut + _REACH) * length) & has_impact
+    now = State(pose + shift * twist, twist)
+    now = _part(scene, params, now, wrench, (cut - _REACH) * length, is_lying)
+    is_hit = is_lying | is_due | impact
+    now = _part(scene, params, now, wrench, 2.0 * _REACH * length, is_hit)
+    rest = (1.0 - cut - _REACH) * length
+    times = _times(world, now.pose, now.twist, gain, rest)
+    is_last = (
+        (times <= _EDGE * length) | (times <= rest) & has_impact | (times == NEVER)
+    )
+    now = _part(scene, params, now, wrench, rest, is_last)
+    now = State(now.pose - shift * now.twist, now.twist)
+    return now.array[: state.shape[0]]
+
+
+def first_impact(
+    world: ContactScene,
+    params: Params,
+    state: Float[Array, "body 6"],
+    action: Float[Array, "body 3"],
+    length: FloatScalar,
+) -> Bool[Array, "all all"]:
+    """Which pair of bodies and walls collides first within a step.
+
+    Given it, `contact_step` is smooth in the state: neighbours that collide a little
+    before the step are taken back and forth to when they do, and so are those that
+    collide a little after it. Neighbours of a state that does not collide do not.
+
+    Args:
+        world: bodies and walls.
+        params: of the block.
+        state: channels of the block's bodies.
+        action: wrenches on them, world frame [N, N, N m].
+        length: of the step [s].
+
+    Returns:
+        The pair, symmetric; none where nothing collides.
+    """
+    begin = _begin(world, params, state, action, length)
+    return _impact(_times(world, *begin[2:4], begin[5], length), length)
+
+
+def _impact(times: Float[Array, "all all"], length) -> Bool[Array, "all all"]:
+    return (times == jnp.min(times)) & (times < length)
+
+
+def _begin(world: ContactScene, params: Params, state, action, length) -> tuple:
+    """The block's bodies and walls: scene, params, pose, twist, wrench, acceleration."""
+    num_walls = world.num_walls
     scene, params = world.scene, _with_walls(params, num_walls)
     pose = jnp.concatenate([state[:, :3], world.wall_pose.astype(state.dtype)])
     twist = jnp.pad(state[:, 3:], ((0, num_walls), (0, 0)))
     wrench = jnp.pad(action, ((0, num_walls), (0, 0)))
-    gain = _acceleration(scene, params, wrench)
-    times = _times(world, pose, twist, gain, length)
-    # Where nothing touches it does not matter where a step is cut.
-    first = jnp.min(times)
-    has_touch = first < length
-    cut = jnp.clip(jnp.where(has_touch, first / length, 0.5), _EDGE, 1.0 - _EDGE)
-    # Pairs that approach are left alone until then.
-    is_due = times <= (cut + _REACH) * length
-    is_first = (times <= _EDGE * length) | (times >= NEVER)
-    is_second = jnp.where(has_touch, is_due, False) | (times >= NEVER)
-    now = State(pose, twist)
-    now = _part(scene, params, now, wrench, (cut - _REACH) * length, is_first)
-    now = _part(scene, params, now, wrench, 2.0 * _REACH * length, is_second)
-    rest = (1.0 - cut - _REACH) * length
-    times = _times(world, now.pose, now.twist, gain, rest)
-    is_last = (times <= rest) | (times >= NEVER)
-    now = _part(scene, params, now, wrench, rest, is_last)
-    return now.array[:num_bodies]
+    return scene, params, pose, twist, wrench, _acceleration(scene, params, wrench)
 
 
-def _times(world: ContactScene, pose, twist, gain, length) -> Float[Array, "body body"]:
+def _times(world: ContactScene, pose, twist, gain, length) -> Float[Array, "all all"]:
     """When pairs touch, with twists as they are on average until the end of a step."""
     free = jnp.where(world.scene.is_static[:, None], 0.0, twist + 0.5 * length * gain)
     return touch_times(world.scene, pose, free, world.sorts)

@@ -19,7 +19,7 @@ from boomdp_jax.inference.kalman import (
     start_scale,
 )
 from boomdp_jax.inference.track_data import TrackData
-from boomdp_jax.inference.tracking import channel_difference, predictor
+from boomdp_jax.inference.tracking import channel_difference, cloud_predictor
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 
@@ -42,7 +42,7 @@ def filter_density(
         The same as `extended_filter` gives. To be batched by `jax.vmap`.
     """
     steps = data.steps
-    predict = predictor(scene, params, steps.dt)
+    predict = cloud_predictor(scene, params, steps.dt)
     num_bodies = steps.state.shape[1]
     num = 6 * num_bodies
     scale = channel_scale(noise.reading).reshape(-1)
@@ -62,7 +62,7 @@ def filter_density(
         )
         state = state + shift.reshape(state.shape)
         points = jnp.concatenate([state[None], state[None] + offsets])
-        images = jax.vmap(lambda x: predict(x, row.action, row.dt))(points)
+        images = predict(points, row.action, row.dt)
         state = images[0]
         rise = (images[1:] - state[None]).reshape(num, num)
         miss = channel_difference(row.last, state).reshape(-1)

@@ -22,8 +22,11 @@ from jaxtyping import Array, Float
 from boomdp_jax.core.lanes import in_lanes
 from boomdp_jax.physics.scene import Scene
 
-NEVER = 1e3
-"""When outlines touch that do not approach [s]."""
+NEVER, PARTING = 1e3, 2e3
+"""When outlines touch that neither approach nor part, and that part fast [s]."""
+
+SLOW = 0.05
+"""Speed up to which outlines that part may lie on each other [m/s]."""
 
 _NUM_NEWTON = 4
 # Speed below which outlines are not taken to approach [m/s].
@@ -74,8 +77,9 @@ def touch_times(
         sorts: which pairs.
 
     Returns:
-        Time from now of each pair, symmetric [s]; zero where outlines overlap and
-        approach, `NEVER` where they do not approach, and for all other pairs.
+        Time from now of each pair, symmetric [s]; negative where outlines that approach
+        overlap already. `NEVER` where they do not approach, and for all other pairs;
+        `PARTING` where they part faster than `SLOW`.
     """
     table = jnp.full((scene.num_bodies, scene.num_bodies), NEVER, pose.dtype)
     if not sorts:
@@ -119,11 +123,12 @@ def _in_lanes(sorts, vertices, radius, pose, twist):
             gap, rate = jax.jvp(apart, (time,), (jnp.ones_like(time),))
             closes = rate < -_LEAST_SPEED
             later = time - gap / jnp.where(closes, rate, -1.0)
-            return jnp.where(closes, jnp.clip(later, 0.0, NEVER), NEVER), None
+            return jnp.where(closes, jnp.clip(later, -NEVER, NEVER), NEVER), None
 
         start = jnp.zeros_like(sides[0].radius)
+        rate = jax.jvp(apart, (start,), (jnp.ones_like(start),))[1]
         found, _ = jax.lax.scan(better, start, None, length=_NUM_NEWTON)
-        times.append(found)
+        times.append(jnp.where(rate > SLOW, PARTING, found))
     return jnp.concatenate(times)
 
 

@@ -22,7 +22,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar, on_device
-from boomdp_jax.inference.contact_prediction import ContactScene, predict_step
+from boomdp_jax.inference.contact_prediction import (
+    ContactScene,
+    contact_step,
+    first_impact,
+    predict_step,
+)
 from boomdp_jax.inference.track_data import TrackData, TrackRow
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
@@ -132,6 +137,42 @@ def predictor(
         return predict_step(scene, params, state, action, length)
 
     return predict
+
+
+Cloud = Callable[
+    [Float[Array, "point body 6"], Float[Array, "body 3"], FloatScalar | None],
+    Float[Array, "point body 6"],
+]
+"""The same for an estimate and its neighbours, the estimate first."""
+
+
+def cloud_predictor(
+    scene: Scene | ContactScene,
+    params: Params,
+    dt: Float[Array, " time"] | Float[Array, ""],
+) -> Cloud:
+    """One step of an estimate and its neighbours, for differences between them.
+
+    Args:
+        scene: the block's scene. With contact neighbours collide in the same step as
+            the estimate does.
+        params: one hypothesis.
+        dt: as for `predictor`.
+    """
+    if isinstance(scene, Scene):
+        predict = predictor(scene, params, dt)
+        return lambda points, action, length: jax.vmap(
+            lambda state: predict(state, action, length)
+        )(points)
+
+    def predict_all(points, action, length):
+        length = dt if length is None else length
+        impact = first_impact(scene, params, points[0], action, length)
+        return jax.vmap(
+            lambda state: contact_step(scene, params, state, action, length, impact)
+        )(points)
+
+    return predict_all
 
 
 def innovations(
