@@ -9,6 +9,7 @@ from boomdp_jax.core.arrays import Key, on_device
 from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.body_numbers import UNASKED, get_number, with_numbers
+from boomdp_jax.inference.contact_numbers import with_contact_numbers
 from boomdp_jax.inference.evidence_report import BlockResult, report_evidence
 from boomdp_jax.inference.layout import BODY_NUMBERS
 from boomdp_jax.inference.noise import host_generator
@@ -92,6 +93,9 @@ def assemble_posterior(
     blocks = [r.block for r in results]
     params, inferred = _merge(spec, blocks, posterior_parts)
     prior_params, _ = _merge(spec, blocks, prior_parts)
+    rng = host_generator(jax.random.fold_in(key, len(results)))
+    params = with_contact_numbers(rng, spec, blocks, posterior_parts, params)
+    prior_params = with_contact_numbers(rng, spec, blocks, prior_parts, prior_params)
     num_draws = params.density.shape[0]
     has_impulses = all(part is not None for part in impulse_parts)
     chain = results[0].draws.chain_index if results else np.arange(num_chains)

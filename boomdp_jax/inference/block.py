@@ -8,12 +8,14 @@ import numpy as np
 
 from boomdp_jax.core.arrays import on_device
 from boomdp_jax.core.history import History
+from boomdp_jax.inference.block_contact import block_contact
 from boomdp_jax.inference.coordinates import Coordinates, surroundings
 from boomdp_jax.inference.filtered_likelihood import FilteredLikelihood
 from boomdp_jax.inference.kalman import channel_scale
 from boomdp_jax.inference.layout import Layout, block_layout, structures
 from boomdp_jax.inference.prior import prior_scales, read_prior
 from boomdp_jax.inference.target import StructureTarget
+from boomdp_jax.inference.touching import Touching
 from boomdp_jax.inference.track_data import track_data
 from boomdp_jax.inference.tracking import one_step_gains
 from boomdp_jax.physics.scene import Scene
@@ -40,6 +42,7 @@ def make_block(
     *,
     is_uniform: bool | None = None,
     weight: np.ndarray | None = None,
+    touching: Touching | None = None,
 ) -> Block:
     """Set up the posterior of a block.
 
@@ -53,12 +56,17 @@ def make_block(
         is_uniform: whether all steps are equally long; default: as the history has it.
         weight: as how many times its likelihood each row counts, `[time]`; default: as
             one.
+        touching: what may have touched; None: nothing collides.
 
     Returns:
         The block.
     """
     options = read_prior(spec.prior, spec.source)
-    layout = block_layout(spec, bodies)
+    contact, inferred = None, ()
+    if touching is not None and touching.pairs[list(bodies)].any():
+        contact = block_contact(spec, bodies, touching)
+        inferred = touching.inferred_in(spec, bodies)
+    layout = block_layout(spec, bodies, inferred)
     rows, log_prior = structures(
         layout, spec.unknown, options, is_loaded=spec.normal_gravity > 0
     )
@@ -70,6 +78,7 @@ def make_block(
             spec, bodies, layout, poses, _forces(history, bodies)
         ),
         scene=_block_scene(spec.scene, bodies),
+        contact=contact,
     )
     if is_uniform is None:
         dt = np.asarray(history.dt)[np.asarray(history.mask)]
@@ -125,7 +134,7 @@ def _forces(history: History, bodies: tuple[int, ...]) -> np.ndarray:
 
 
 def _block_scene(scene: Scene, bodies: tuple[int, ...]) -> Scene:
-    """The scene of a block's bodies; outlines shrink to a point, nothing collides."""
+    """The scene of a block's bodies; outlines shrink to a point: see `contact`."""
     index = np.asarray(bodies)
 
     def pick(array):

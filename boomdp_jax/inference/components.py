@@ -1,10 +1,12 @@
-"""Which bodies must be inferred together: screening of possible ties."""
+"""Which bodies must be inferred together: screening of possible ties and contacts."""
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 
 from boomdp_jax.core.history import History
+from boomdp_jax.inference.touching import Touching
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 # A pair whose best common pin misses by more than this [m], root mean square, is not
@@ -13,11 +15,15 @@ TIE_TOLERANCE = 0.03
 
 
 def independent_blocks(
-    spec: SceneSpec, history: History
+    spec: SceneSpec, history: History, touching: Touching | None = None
 ) -> tuple[list[tuple[int, ...]], list[str]]:
     """Split the movable bodies of a scene into blocks that do not interact.
 
-    Known constraints tie bodies for certain. A pair that may be tied by an unknown pin
+    Bodies that may have touched each other belong together, and so do all that may have
+    touched anything of which the scene leaves a contact number open: it is one number
+    for the whole scene. Known constraints tie bodies for certain.
+
+    A pair that may be tied by an unknown pin
     (or a weld, which is a pin as well) is tested by the least-squares misfit of the
     best common anchors; one that may be tied by an unknown rod, by how much the
     distance of its centres varies beyond what the outlines' radii allow; by an unknown
@@ -26,6 +32,7 @@ def independent_blocks(
     Args:
         spec: the scene.
         history: readings of all its bodies.
+        touching: what may have touched; None: nothing collides.
 
     Returns:
         Blocks of body indices, ascending, static bodies left out; and a note on the
@@ -43,6 +50,8 @@ def independent_blocks(
         a, b = constraint.body_a, constraint.body_b
         if a in parent and b in parent:
             parent[root(a)] = root(b)
+    if touching is not None:
+        _join_touching(touching, parent, root)
     dropped = []
     can_pin = spec.unknown.get("revolute", 0) or spec.unknown.get("weld", 0)
     can_rod, can_slide = (spec.unknown.get(k, 0) for k in ("distance", "prismatic"))
@@ -69,6 +78,18 @@ def independent_blocks(
         blocks.setdefault(root(i), []).append(i)
     notes = [f"pairs taken as not tied (best pin misses by): {', '.join(dropped)}"]
     return sorted(map(tuple, blocks.values())), notes if dropped else []
+
+
+def _join_touching(touching: Touching, parent: dict, root: Callable) -> None:
+    """Join bodies that may have touched, or that share an open contact number."""
+    sharing = set()
+    for a, b in np.argwhere(touching.pairs).tolist():
+        if a in parent and b in parent:
+            parent[root(a)] = root(b)
+        if a in parent and touching.has_unknown(a, b):
+            sharing.add(a)
+    for a, b in itertools.pairwise(sorted(sharing)):
+        parent[root(a)] = root(b)
 
 
 def _pin_misfit(a: np.ndarray, b: np.ndarray) -> float:

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import on_device
 from boomdp_jax.inference.body_numbers import numbers_of, with_numbers
+from boomdp_jax.inference.contact_prediction import ContactScene
 from boomdp_jax.inference.layout import Layout, SlotKey
 from boomdp_jax.inference.prior import PriorScales
 from boomdp_jax.inference.resting import rest_numbers, rest_pose
@@ -29,6 +30,7 @@ from boomdp_jax.physics.params import (
     Params,
     Prismatic,
     Revolute,
+    Surface,
     Weld,
     Wheel,
 )
@@ -191,6 +193,15 @@ def _place(slot: SlotKey) -> tuple[str, int, int]:
     return slot.kind, body, slot.index
 
 
+class Contact(eqx.Module):
+    """What a block's bodies may touch: each other, and walls."""
+
+    world: ContactScene
+    friction: Float[Array, " surface"]
+    """Of the block's bodies, then of the walls; NaN where it is to be inferred."""
+    restitution: Float[Array, " surface"]
+
+
 class Coordinates(eqx.Module):
     """The map from coordinates and active slots to `Params` of one block."""
 
@@ -198,6 +209,13 @@ class Coordinates(eqx.Module):
     scales: PriorScales
     surroundings: Surroundings
     scene: Scene
+    contact: Contact | None = None
+    """None: nothing collides."""
+
+    @property
+    def world(self) -> Scene | ContactScene:
+        """What likelihoods step."""
+        return self.scene if self.contact is None else self.contact.world
 
     def __call__(self, z: Float[Array, " dim"], active: Bool[Array, " slot"]) -> Params:
         """Params of a hypothesis; slots that are not active hold zeros.
@@ -242,6 +260,7 @@ class Coordinates(eqx.Module):
             distance=Distance(**self._joint_arrays("distance", made)),
             wheel=Wheel(**self._body_arrays("wheel", made)),
             ground=Ground(**self._body_arrays("ground", made)),
+            surface=None if self.contact is None else self._surface(self.contact, z),
             prismatic=Prismatic(**self._joint_arrays("prismatic", made))
             if "prismatic" in has
             else None,
@@ -249,6 +268,26 @@ class Coordinates(eqx.Module):
         )
         numbers = numbers_of(z, self.layout, self.scales, around, self.scene.gyration)
         return with_numbers(params, numbers) if numbers else params
+
+    def contact_numbers(self, z: Float[Array, " dim"]) -> dict[str, Float[Array, ""]]:
+        """Numbers of contact that are inferred, by `Layout.contact`."""
+        links = {"friction": jnp.exp, "restitution": jax.nn.sigmoid}
+        return {
+            name: links[name](
+                self._scaled(f"contact.{name}", z[self.layout.contact_coordinate(name)])
+            )
+            for name in self.layout.contact
+        }
+
+    def _surface(self, contact: Contact, z) -> Surface:
+        """Contact of the block's bodies, and of the walls after them."""
+        numbers, out = self.contact_numbers(z), {}
+        for name in ("friction", "restitution"):
+            known = getattr(contact, name)
+            if name in numbers:
+                known = jnp.where(jnp.isnan(known), numbers[name], known)
+            out[name] = known
+        return Surface(**out)
 
     def _scaled(self, name: str, z):
         return self.scales.center[name] + self.scales.spread[name] * z

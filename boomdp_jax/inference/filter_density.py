@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from boomdp_jax.core.arrays import FloatScalar
+from boomdp_jax.inference.contact_prediction import ContactScene
 from boomdp_jax.inference.filter_update import correct, move_and_correct
 from boomdp_jax.inference.kalman import (
     NoiseLevel,
@@ -18,13 +19,16 @@ from boomdp_jax.inference.kalman import (
     start_scale,
 )
 from boomdp_jax.inference.track_data import TrackData, with_delay
-from boomdp_jax.inference.tracking import channel_difference, predictor
+from boomdp_jax.inference.tracking import channel_difference, cloud_predictor
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 
 
 def filter_density(
-    scene: Scene, params: Params, data: TrackData, noise: NoiseLevel
+    scene: Scene | ContactScene,
+    params: Params,
+    data: TrackData,
+    noise: NoiseLevel,
 ) -> FloatScalar:
     """Log-density of all readings but the first of each track.
 
@@ -39,7 +43,7 @@ def filter_density(
     """
     data = with_delay(params, data)
     steps = data.steps
-    predict = predictor(scene, params, steps.dt)
+    predict = cloud_predictor(scene, params, steps.dt)
     num_bodies = steps.state.shape[1]
     num = 6 * num_bodies
     scale = channel_scale(noise.reading).reshape(-1)
@@ -59,7 +63,7 @@ def filter_density(
         )
         state = state + shift.reshape(state.shape)
         points = jnp.concatenate([state[None], state[None] + offsets])
-        images = jax.vmap(lambda x: predict(x, row.action, row.dt))(points)
+        images = predict(points, row.action, row.dt)
         state = images[0]
         rise = (images[1:] - state[None]).reshape(num, num)
         miss = channel_difference(row.last, state).reshape(-1)

@@ -31,7 +31,7 @@ def _densities_of_chunks(known, active, z, noise):
 
         def one_point(active, z, noise):
             params = coordinates(z, active)
-            return filter_density(coordinates.scene, params, data, NoiseLevel(*noise))
+            return filter_density(coordinates.world, params, data, NoiseLevel(*noise))
 
         return jax.vmap(one_point)(active, z, noise)
 
@@ -90,7 +90,7 @@ def _filter_each(known, active, z, noise) -> Filtered:
     def one(known, active, z, noise):
         coordinates, data = known
         params = coordinates(z, active)
-        return extended_filter(coordinates.scene, params, data, NoiseLevel(*noise))
+        return extended_filter(coordinates.world, params, data, NoiseLevel(*noise))
 
     return jax.vmap(one)(known, active, z, noise)
 

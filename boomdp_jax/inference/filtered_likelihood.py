@@ -70,7 +70,7 @@ class FilteredLikelihood(eqx.Module):
     ) -> Innovations:
         """Whitened innovations at a hypothesis, and their sums of squares."""
         params = self.coordinates(z, active)
-        whitened = innovations(self.coordinates.scene, params, self.data, gains)
+        whitened = innovations(self.coordinates.world, params, self.data, gains)
         weight = self.data.weight
         if weight is not None:
             whitened = whitened * jnp.sqrt(weight)[:, None, None, None]

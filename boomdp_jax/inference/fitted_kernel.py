@@ -19,6 +19,7 @@ from boomdp_jax.inference.slot_names import (
 )
 from boomdp_jax.inference.structure_chain import ChainSettings
 from boomdp_jax.inference.structure_kernel import StructureKernel
+from boomdp_jax.inference.touching import Touching, find_touching
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 
@@ -66,7 +67,9 @@ def structure_kernel(
             f"{spec.source}: history: expected {spec.num_bodies} bodies, got "
             f"{history.num_bodies}"
         )
-    block = make_block(spec, _choose_block(spec, history, bodies), history)
+    touching = find_touching(spec, history)
+    chosen = _choose_block(spec, history, touching, bodies)
+    block = make_block(spec, chosen, history, touching=touching)
     names = tuple(spec.names[i] for i in block.bodies)
     fitted = fitted_mixture(key, block.target)
     block = block._replace(target=fitted.target)
@@ -108,14 +111,19 @@ class NamedNumbers(eqx.Module):
         around = coordinates.surroundings
         given = known_numbers(self.names, layout, around.known, around.density)
         kept = {name: value for name, value in numbers.items() if name not in given}
+        contact = coordinates.contact_numbers(sample["z"])
+        kept |= {f"contact.{name}": value for name, value in contact.items()}
         return {"structure": sample["structure"], **indicators, **kept}
 
 
 def _choose_block(
-    spec: SceneSpec, history: History, bodies: Sequence[str] | None
+    spec: SceneSpec,
+    history: History,
+    touching: Touching | None,
+    bodies: Sequence[str] | None,
 ) -> tuple[int, ...]:
     """The block of bodies that was meant."""
-    blocks, _ = independent_blocks(spec, history)
+    blocks, _ = independent_blocks(spec, history, touching)
     if not blocks:
         raise ValueError(f"{spec.source}: expected a body that can move, got none")
     lists = "; ".join(str([spec.names[i] for i in block]) for block in blocks)

@@ -14,6 +14,7 @@ from boomdp_jax.inference.block import Block, make_block
 from boomdp_jax.inference.components import independent_blocks
 from boomdp_jax.inference.layout import Layout, SlotKey, block_layout
 from boomdp_jax.inference.redundancy import NEW_KINDS, Tie, is_redundant
+from boomdp_jax.inference.touching import find_touching
 from boomdp_jax.physics.constraint_spec import JOINTS, KINDS, ConstraintSpec
 from boomdp_jax.physics.params import WORLD
 from boomdp_jax.physics.scene_spec import SceneSpec
@@ -136,9 +137,13 @@ def structure_blocks(
         ValueError: as in `fix_structure`.
     """
     fixed = fix_structure(spec, structure)
-    blocks, _ = independent_blocks(fixed, history)
+    touching = find_touching(fixed, history)
+    blocks, _ = independent_blocks(fixed, history, touching)
     num_known = len(spec.constraints)
-    return [_as_inferred(make_block(fixed, b, history), num_known) for b in blocks]
+    return [
+        _as_inferred(make_block(fixed, b, history, touching=touching), num_known)
+        for b in blocks
+    ]
 
 
 def _as_inferred(block: Block, num_known: int) -> Block:

@@ -23,6 +23,7 @@ from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.sample import sample_blocks
 from boomdp_jax.inference.structure_draws import SampleSettings
 from boomdp_jax.inference.svi import run_svi
+from boomdp_jax.inference.touching import find_touching
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 METHODS = ("auto", "rj", "enumerate", "smc", "nuts", "svi", "laplace", "map")
@@ -179,9 +180,13 @@ def _infer_structures(
     histories = padded_histories(histories)
     problems, notes = [], []
     for index, (spec, history) in enumerate(zip(specs, histories, strict=True)):
-        blocks, screened = independent_blocks(spec, history)
+        touching = find_touching(spec, history)
+        blocks, screened = independent_blocks(spec, history, touching)
         notes.append(screened)
-        problems += [(index, make_block(spec, b, history)) for b in blocks]
+        problems += [
+            (index, make_block(spec, bodies, history, touching=touching))
+            for bodies in blocks
+        ]
     results: dict[int, list[BlockResult]] = {i: [] for i in range(len(specs))}
     groups = _group(problems)
     with CompileClock() as clock, _Bar(progress, len(problems)) as bar:

@@ -24,8 +24,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar
+from boomdp_jax.inference.contact_prediction import ContactScene
 from boomdp_jax.inference.track_data import TrackData, TrackRow, with_delay
-from boomdp_jax.inference.tracking import Gains, channel_difference, predictor
+from boomdp_jax.inference.tracking import Gains, channel_difference, cloud_predictor
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 
@@ -94,7 +95,7 @@ class RowFilter:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Scene | ContactScene,
         params: Params,
         dt: Float[Array, " time"] | Float[Array, ""],
         noise: NoiseLevel,
@@ -109,7 +110,7 @@ class RowFilter:
         """
         num_bodies = noise.reading.shape[0]
         self._num = 6 * num_bodies
-        self._predict = predictor(scene, params, dt)
+        self._predict = cloud_predictor(scene, params, dt)
         self._scale = channel_scale(noise.reading).reshape(-1)
         self._variance = jnp.diag(self._scale**2)
         self._kick = kick_scale(noise.impulse).reshape(-1)
@@ -133,7 +134,7 @@ class RowFilter:
             estimate, row.first, row.is_second * row.first_mask
         )
         points = jnp.concatenate([state[None], state[None] + self._offsets])
-        images = jax.vmap(lambda x: self._predict(x, row.action, row.dt))(points)
+        images = self._predict(points, row.action, row.dt)
         slope = (images[1:] - images[:1]).reshape(num, num).T / self._scale[None]
         spread = covariance + jnp.diag(self._kick**2)
         covariance = slope @ spread @ slope.T
@@ -167,7 +168,10 @@ class RowFilter:
 
 
 def extended_filter(
-    scene: Scene, params: Params, data: TrackData, noise: NoiseLevel
+    scene: Scene | ContactScene,
+    params: Params,
+    data: TrackData,
+    noise: NoiseLevel,
 ) -> Filtered:
     """Filter all rows at one hypothesis.
 

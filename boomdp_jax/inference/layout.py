@@ -65,7 +65,8 @@ class SlotKey(NamedTuple):
 class Layout(NamedTuple):
     """Slots and coordinates of a block; static, so that equal blocks share a program.
 
-    Coordinates: the log-density of each body, those of each slot, then the rest.
+    Coordinates: the log-density of each body, those of each slot, numbers of bodies
+    and, last, of contact.
     """
 
     num_bodies: int
@@ -75,6 +76,13 @@ class Layout(NamedTuple):
     """Slots of constraints that are known to exist."""
     dim: int
     numbers: tuple[BodyNumber, ...] = ()
+    contact: tuple[str, ...] = ()
+    """Numbers of contact that are inferred, `friction` or `restitution`, whose
+    coordinates are the last ones."""
+
+    def contact_coordinate(self, name: str) -> int:
+        """Which coordinate a number of contact has."""
+        return self.dim - len(self.contact) + self.contact.index(name)
 
     def count(self, kind: str) -> int:
         """How many slots of a kind `Params` needs (per body for wheel and ground)."""
@@ -108,12 +116,15 @@ class Layout(NamedTuple):
         return tuple(slot for slot in slots if slot.kind in NEW_KINDS)
 
 
-def block_layout(spec: SceneSpec, bodies: tuple[int, ...]) -> Layout:
+def block_layout(
+    spec: SceneSpec, bodies: tuple[int, ...], contact: tuple[str, ...] = ()
+) -> Layout:
     """Lay out the constraints that a block of bodies may have.
 
     Args:
         spec: the scene.
         bodies: indices of the block's bodies in the scene, ascending.
+        contact: numbers of contact that are inferred.
 
     Returns:
         The layout; its body indices count within the block.
@@ -163,7 +174,14 @@ def block_layout(spec: SceneSpec, bodies: tuple[int, ...]) -> Layout:
             if is_unknown:
                 numbers.append(BodyNumber(name, i, start))
                 start += count
-    return Layout(len(bodies), tuple(inferred), tuple(known), start, tuple(numbers))
+    return Layout(
+        len(bodies),
+        tuple(inferred),
+        tuple(known),
+        start + len(contact),
+        tuple(numbers),
+        contact,
+    )
 
 
 def _refuse_drives(spec: SceneSpec) -> None:

@@ -172,6 +172,12 @@ def block_sites(block: Block, names: tuple[str, ...]) -> tuple[Site, ...]:
     ]
     for slot, name in slot_names(names, block.layout).items():
         sites += _slot_sites(slot, name, likelihood.coordinates)
+    for name in block.layout.contact:
+        entry = f"contact.{name}"
+        center, spread = scales.center[entry], scales.spread[entry]
+        link = "log" if entry in LOGARITHMIC else "logit"
+        place = block.layout.contact_coordinate(name)
+        sites.append(Site(entry, (place,), link, center, spread))
     kept = []
     for site in sites:
         free = [place for place, c in enumerate(site.coordinates) if is_free[c]]

@@ -26,6 +26,7 @@ from numpyro.distributions import transforms
 
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.block import Block
+from boomdp_jax.inference.contact_prediction import ContactScene, predict_step
 from boomdp_jax.inference.fixed_structure import Structure, structure_blocks
 from boomdp_jax.inference.model_sites import Site, block_sites
 from boomdp_jax.inference.one_step import NOISE_SHAPE, Readings, in_effect, readings
@@ -34,8 +35,6 @@ from boomdp_jax.inference.slot_names import known_numbers, physical_numbers
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.scene_spec import SceneSpec
-from boomdp_jax.physics.state import state_from_array
-from boomdp_jax.physics.step import step
 
 # Channel group of x, y, theta, xdot, ydot, thetadot.
 _GROUP = (0, 0, 1, 2, 2, 3)
@@ -110,7 +109,7 @@ class ObjectModel(eqx.Module):
             params = self._sample_params(number)
             place = np.searchsorted(bodies, block.bodies)
             likelihood: Any = block.target.log_likelihood
-            prediction = _predict(likelihood.coordinates.scene, params, data[number])
+            prediction = _predict(likelihood.coordinates.world, params, data[number])
             predicted = predicted.at[:, place].set(prediction)
             read = read.at[:, place].set(data[number].next_state)
             counts = counts.at[:, place].set(data[number].mask)
@@ -241,12 +240,12 @@ def noise_prior(scale: Float[Array, ""]) -> dist.Distribution:
 
 
 def _predict(
-    scene: Scene, params: Params, data: Readings
+    scene: Scene | ContactScene, params: Params, data: Readings
 ) -> Float[Array, "time body 6"]:
     """Where every recorded step should end."""
 
     def one(state: Array, action: Array, dt: Array) -> Array:
-        return step(scene, params, state_from_array(state), action, dt=dt)[0].array
+        return predict_step(scene, params, state, action, dt)
 
     in_axes = (0, 0, 0 if data.dt.ndim else None)
     return jax.vmap(one, in_axes)(data.state, in_effect(params, data), data.dt)

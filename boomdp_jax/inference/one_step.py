@@ -22,12 +22,11 @@ from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import FloatScalar, Key, on_device
 from boomdp_jax.core.history import History
+from boomdp_jax.inference.contact_prediction import ContactScene, predict_step
 from boomdp_jax.inference.coordinates import Coordinates
 from boomdp_jax.physics.actuator import Commands, delayed, past_commands
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
-from boomdp_jax.physics.state import state_from_array
-from boomdp_jax.physics.step import step
 
 NOISE_SHAPE = 1.0
 """Shape of the inverse-gamma prior of a noise variance."""
@@ -105,7 +104,7 @@ class NoiseStatistics(NamedTuple):
 
 
 def residuals(
-    scene: Scene, params: Params, data: Readings
+    scene: Scene | ContactScene, params: Params, data: Readings
 ) -> Float[Array, "time body 6"]:
     """Predicted minus read, zero where nothing was read.
 
@@ -119,7 +118,7 @@ def residuals(
     """
 
     def predict(state, action, dt):
-        return step(scene, params, state_from_array(state), action, dt=dt)[0].array
+        return predict_step(scene, params, state, action, dt)
 
     in_axes = (0, 0, 0 if data.dt.ndim else None)
     predicted = jax.vmap(predict, in_axes)(data.state, in_effect(params, data), data.dt)
@@ -143,7 +142,9 @@ def group_sums(values: Float[Array, "time body 6"]) -> Float[Array, "body 4"]:
     )
 
 
-def noise_statistics(scene: Scene, params: Params, data: Readings) -> NoiseStatistics:
+def noise_statistics(
+    scene: Scene | ContactScene, params: Params, data: Readings
+) -> NoiseStatistics:
     """Counts and sums of squares of the residuals."""
     difference = residuals(scene, params, data)
     return NoiseStatistics(group_sums(data.mask), group_sums(difference**2))
@@ -211,11 +212,11 @@ class OneStepLikelihood(eqx.Module):
     ) -> NoiseStatistics:
         """Counts and sums of squares at a hypothesis."""
         params = self.coordinates(z, active)
-        return noise_statistics(self.coordinates.scene, params, self.data)
+        return noise_statistics(self.coordinates.world, params, self.data)
 
     def residuals(
         self, z: Float[Array, " dim"], active: Bool[Array, " slot"]
     ) -> Float[Array, "time body 6"]:
         """Residuals at a hypothesis."""
         params = self.coordinates(z, active)
-        return residuals(self.coordinates.scene, params, self.data)
+        return residuals(self.coordinates.world, params, self.data)

@@ -30,6 +30,7 @@ from boomdp_jax.inference.fixed_structure import (
 from boomdp_jax.inference.numpyro_model import model_of_blocks
 from boomdp_jax.inference.posterior import Posterior, with_diagnostics
 from boomdp_jax.inference.sample import BlockDraws
+from boomdp_jax.inference.touching import find_touching
 from boomdp_jax.physics.params import WORLD
 from boomdp_jax.physics.scene_spec import SceneSpec
 
@@ -125,12 +126,13 @@ def _most_probable(
     key: Key, spec: SceneSpec, history: History, method: str
 ) -> tuple[dict[str, list], list[str], list[str]]:
     """The most probable structure of every block, notes, and reasons for doubt."""
-    blocks, notes = independent_blocks(spec, history)
+    touching = find_touching(spec, history)
+    blocks, notes = independent_blocks(spec, history, touching)
     notes = list(notes)
     structure: dict[str, list] = {}
     doubts = []
     for number, bodies in enumerate(blocks):
-        block = make_block(spec, bodies, history)
+        block = make_block(spec, bodies, history, touching=touching)
         fitted = fitted_mixture(jax.random.fold_in(key, number), block.target)
         evidence = fitted.evidence
         best = int(jnp.argmax(evidence.probability))

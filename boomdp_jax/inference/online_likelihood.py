@@ -89,7 +89,7 @@ def _track(
     """One point through all rows."""
     coordinates, data = likelihood.coordinates, likelihood.data
     params = coordinates(z, active)
-    predict = predictor(coordinates.scene, params, data.steps.dt)
+    predict = predictor(coordinates.world, params, data.steps.dt)
 
     def advance(index, carry):
         state, square = carry
@@ -128,7 +128,7 @@ def track_one_row(
 
     def one(k, z, mean):
         params = coordinates(z, target.structures[k])
-        predict = predictor(coordinates.scene, params, likelihood.data.steps.dt)
+        predict = predictor(coordinates.world, params, likelihood.data.steps.dt)
         gain = jax.tree.map(lambda leaf: leaf[k], gains)
         state, whitened = track_row(predict, mean, row, gain)
         return state, group_sums(whitened[None] ** 2)

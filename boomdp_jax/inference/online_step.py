@@ -194,7 +194,7 @@ def _filter_row(
 
     def take(z, active, estimate, noise):
         params = coordinates(z, active)
-        return RowFilter(coordinates.scene, params, dt, noise)(estimate, row)
+        return RowFilter(coordinates.world, params, dt, noise)(estimate, row)
 
     estimate, found = jax.vmap(take)(
         champions.z, target.structures, champions.estimate, champions.noise

@@ -19,6 +19,7 @@ from boomdp_jax.physics.params import (
     Params,
     Prismatic,
     Revolute,
+    Surface,
     Weld,
     Wheel,
 )
@@ -34,6 +35,7 @@ _GROUPS = {
     "weld": Weld,
     "wheel": Wheel,
     "ground": Ground,
+    "surface": Surface,
 }
 _OPTIONAL = ("prismatic", "weld")
 """Groups that a file may do without: scenes may, and those of earlier versions did."""
@@ -79,6 +81,7 @@ _PARAM_SHAPES = {
     "weld": ("weld slot",),
     "wheel": ("body", "wheel slot"),
     "ground": ("body", "ground slot"),
+    "surface": ("body",),
 }
 _IMPULSES = ("impulse_scale", "prior_impulse_scale")
 """Both are there, or neither."""
@@ -89,6 +92,7 @@ _PAIRS = {
     "weld": ("anchor_a", "anchor_b"),
     "wheel": ("position", "viscous", "dry"),
     "ground": ("load_shift",),
+    "surface": (),
 }
 """Fields with two numbers in each slot."""
 
@@ -192,6 +196,8 @@ def _unflatten(prefix: str, arrays: Mapping[str, np.ndarray]) -> Params:
 
 def _has(group: str, arrays: Mapping[str, np.ndarray]) -> bool:
     """Whether a file has a group, or must have it."""
+    if group == "surface":
+        return any(name.startswith("params.surface.") for name in arrays)
     return group not in _OPTIONAL or f"inferred.{group}" in arrays
 
 

@@ -256,6 +256,11 @@ def format_report(report: dict, structures: dict[str, float], num_draws: int) ->
     if report["known_constraints"]:
         lines += ["", "known constraints with inferred numbers"]
         lines += _constraint_lines(report["known_constraints"])
+    if "contact" in report:
+        lines += ["", "contact"]
+    for name, number in report.get("contact", {}).items():
+        bodies = ", ".join(number["bodies"])
+        lines.append(f"  {name:<20}{_quantity(number, [''])} ({bodies})")
     lines += ["", "noise of one reading (sd)"]
     for name, noise in report["noise"].items():
         parts = [
@@ -318,6 +323,7 @@ def _quantity(summary: dict, units: list[str]) -> str:
     columns = {
         key: value if isinstance(value, list) else [value]
         for key, value in summary.items()
+        if key != "bodies"
     }
     parts = []
     for place, unit in enumerate(units):

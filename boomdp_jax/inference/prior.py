@@ -68,6 +68,10 @@ DEFAULT_SCALES: dict[str, Scale] = {
     "actuator.gain": Scale(1.0, 0.3),
     "actuator.bias": Scale(0.0, 0.2),
     "actuator.delay": Scale(0.02, 1.0),
+    # Of surfaces that touch, friction log-normal and restitution logit-normal: about
+    # uniform.
+    "contact.friction": Scale(0.3, 0.8),
+    "contact.restitution": Scale(0.0, 1.5),
 }
 """Centre and spread of every quantity that is inferred."""
 
@@ -86,6 +90,7 @@ LOGARITHMIC = frozenset(
         "wheel.half_track",
         "ground.friction",
         "ground.knee_speed",
+        "contact.friction",
     }
 )
 """Quantities that are sampled as logarithms; their centre is a median."""

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-Scale = Literal["identity", "log", "axial"]
+Scale = Literal["identity", "log", "logit", "axial"]
 """Scale on which spread is judged; `axial`: an angle that is the same modulo pi."""
 
 CHANNELS = ("position", "angle", "velocity", "spin")
@@ -168,5 +168,8 @@ def _variance(value: np.ndarray, weights: np.ndarray, scale: Scale) -> float:
         value = axial_difference(value, axial_mean(value, weights))
     elif scale == "log":
         value = np.log(np.maximum(value, np.finfo(np.float32).tiny))
+    elif scale == "logit":
+        size = np.finfo(np.float32).tiny
+        value = np.log(np.maximum(value, size)) - np.log(np.maximum(1.0 - value, size))
     with np.errstate(invalid="ignore"):
         return float(weights @ (value - weights @ value) ** 2)

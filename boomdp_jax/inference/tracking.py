@@ -22,11 +22,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar, on_device
+from boomdp_jax.inference.contact_prediction import (
+    ContactScene,
+    contact_step,
+    first_impact,
+    predict_step,
+)
 from boomdp_jax.inference.track_data import TrackData, TrackRow, with_delay
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import state_from_array
-from boomdp_jax.physics.step import prepare_step, step
+from boomdp_jax.physics.step import prepare_step
 
 # Largest number of channels for which products with gains are written out; beyond it
 # a library call costs less than the compilation of so many terms.
@@ -108,30 +114,69 @@ Predict = Callable[
 
 
 def predictor(
-    scene: Scene, params: Params, dt: Float[Array, " time"] | Float[Array, ""]
+    scene: Scene | ContactScene,
+    params: Params,
+    dt: Float[Array, " time"] | Float[Array, ""],
 ) -> Predict:
     """One step from channels to channels.
 
     Args:
-        scene: the block's scene.
+        scene: the block's scene, with contact or without.
         params: one hypothesis.
         dt: length of all steps, or of each; if of all, what depends on it and on the
             hypothesis alone is worked out once.
     """
-    if dt.ndim == 0:
+    if dt.ndim == 0 and isinstance(scene, Scene):
         prepared = prepare_step(scene, params, dt=dt)
         return lambda state, action, _: (
             prepared(state_from_array(state), action)[0].array
         )
 
     def predict(state, action, length):
-        return step(scene, params, state_from_array(state), action, dt=length)[0].array
+        length = dt if length is None else length
+        return predict_step(scene, params, state, action, length)
 
     return predict
 
 
+Cloud = Callable[
+    [Float[Array, "point body 6"], Float[Array, "body 3"], FloatScalar | None],
+    Float[Array, "point body 6"],
+]
+"""The same for an estimate and its neighbours, the estimate first."""
+
+
+def cloud_predictor(
+    scene: Scene | ContactScene,
+    params: Params,
+    dt: Float[Array, " time"] | Float[Array, ""],
+) -> Cloud:
+    """One step of an estimate and its neighbours, for differences between them.
+
+    Args:
+        scene: the block's scene. With contact neighbours collide in the same step as
+            the estimate does.
+        params: one hypothesis.
+        dt: as for `predictor`.
+    """
+    if isinstance(scene, Scene):
+        predict = predictor(scene, params, dt)
+        return lambda points, action, length: jax.vmap(
+            lambda state: predict(state, action, length)
+        )(points)
+
+    def predict_all(points, action, length):
+        length = dt if length is None else length
+        impact = first_impact(scene, params, points[0], action, length)
+        return jax.vmap(
+            lambda state: contact_step(scene, params, state, action, length, impact)
+        )(points)
+
+    return predict_all
+
+
 def innovations(
-    scene: Scene, params: Params, data: TrackData, gains: Gains
+    scene: Scene | ContactScene, params: Params, data: TrackData, gains: Gains
 ) -> Float[Array, "time 2 body 6"]:
     """Whitened innovations of all readings, zero where nothing was read.
 

@@ -115,6 +115,10 @@ def _variables(
             dims[name] = ["body", *_BODY_DIMS.get(key, ())]
     if "impulse_scale" in numbers:
         dims["impulse_scale"] = ["body", "impulse"]
+    if params.surface is not None:
+        for field, array in vars(params.surface).items():
+            name = f"contact_{field}"
+            numbers[name], dims[name] = array, ["body"]
     slot_dims = {
         **{kind: [kind] for kind in JOINTS},
         "wheel": ["body", "wheel"],

@@ -1,0 +1,107 @@
+"""Friction and restitution of contact that a scene leaves open: draws and reports."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from boomdp_jax.core.arrays import on_device
+from boomdp_jax.inference.block import Block
+from boomdp_jax.inference.prior import LOGARITHMIC, read_prior
+from boomdp_jax.inference.summary import Scale, summarise
+from boomdp_jax.inference.touching import CONTACT_NUMBERS, unknown_contact
+from boomdp_jax.physics.params import Params, Surface
+from boomdp_jax.physics.scene_arrays import build_surface
+from boomdp_jax.physics.scene_spec import SceneSpec
+
+_SCALES: dict[str, Scale] = {"friction": "log", "restitution": "logit"}
+
+
+def with_contact_numbers(
+    rng: np.random.Generator,
+    spec: SceneSpec,
+    blocks: list[Block],
+    parts: list[Params],
+    params: Params,
+) -> Params:
+    """Draws of a scene with the contact numbers that are inferred.
+
+    Args:
+        rng: source of prior draws.
+        spec: the scene.
+        blocks: of its bodies.
+        parts: draws of each.
+        params: draws of the whole scene without a surface.
+
+    Returns:
+        The same with friction and restitution of every body; a number that is left
+        open, and of which no block says anything, is drawn from its prior. The params
+        themselves where nothing is left open, or where nothing can touch.
+    """
+    known, unknown = build_surface(spec.bodies), unknown_contact(spec)
+    if known is None or not any(np.any(body) for body in unknown.values()):
+        return params
+    num_draws, arrays = params.density.shape[0], {}
+    for name in CONTACT_NUMBERS:
+        values = np.asarray(getattr(known, name))
+        values = np.broadcast_to(values, (num_draws, len(values))).copy()
+        own = _draws(blocks, parts, name)
+        if own is None:
+            own = _prior_draws(rng, spec, name, num_draws)
+        values[:, unknown[name]] = own[:, None]
+        arrays[name] = on_device(values, params.density.dtype)
+    return dataclasses.replace(params, surface=Surface(**arrays))
+
+
+def _draws(blocks: list[Block], parts: list[Params], name: str) -> np.ndarray | None:
+    """Draws of a number by the block that depends on it, if there is one."""
+    for block, part in zip(blocks, parts, strict=True):
+        if name not in block.layout.contact:
+            continue
+        likelihood: Any = block.target.log_likelihood
+        place = np.isnan(np.asarray(getattr(likelihood.coordinates.contact, name)))
+        return np.asarray(getattr(part.surface, name))[:, int(np.argmax(place))]
+    return None
+
+
+def _prior_draws(
+    rng: np.random.Generator, spec: SceneSpec, name: str, num_draws: int
+) -> np.ndarray:
+    key = f"contact.{name}"
+    scale = read_prior(spec.prior, spec.source).scales[key]
+    normal = scale.spread * rng.standard_normal(num_draws)
+    if key in LOGARITHMIC:
+        return scale.center * np.exp(normal)
+    return 1.0 / (1.0 + np.exp(-scale.center - normal))
+
+
+def report_contact(
+    spec: SceneSpec, params: Params, weights: np.ndarray, prior_params: Params
+) -> dict:
+    """What is known of contact numbers that the scene leaves open.
+
+    Args:
+        spec: the scene.
+        params: draws, NumPy arrays with a leading draw axis.
+        weights: of the draws, sum to one, `[draw]`.
+        prior_params: prior draws.
+
+    Returns:
+        By number (`friction`, `restitution`) a summary, and the `bodies` whose number
+        it is; empty where none is inferred.
+    """
+    if params.surface is None or prior_params.surface is None:
+        return {}
+    report = {}
+    for name, is_open in unknown_contact(spec).items():
+        if not is_open.any():
+            continue
+        place = int(np.argmax(is_open))
+        value, prior = (
+            np.asarray(getattr(surface, name))[:, place]
+            for surface in (params.surface, prior_params.surface)
+        )
+        names = [spec.names[i] for i in np.flatnonzero(is_open)]
+        found = summarise(value, weights, prior, _SCALES[name])
+        report[name] = {"bodies": names, **found}
+    return report
