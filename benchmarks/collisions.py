@@ -1,11 +1,11 @@
 """What collisions of two bodies tell, with no force applied and positions only.
 
-Two discs of random size, mass, friction and restitution drift towards each other, collide
-off their centres and part. A camera sees where they are and how they have turned, never
-how fast. `infer` is asked for the ratio of their masses and for the numbers of contact,
-and set against the closed form of `_two_discs.py`: truth and error, coverage of the 90 %
-intervals, and mean and sd of a posterior on a grid that knows the noise and takes the
-motion as exact (`infer` infers both, so that its intervals are a little wider). Before
+Two discs of random size, mass, friction and restitution drift towards each other,
+collide off their centres and part. A camera sees where they are and how they have
+turned, never how fast. `infer` is asked for the ratio of their masses and for the
+numbers of contact, and set against the closed form of `_two_discs.py`: error, coverage
+of the 90 % intervals, and mean and sd of a posterior on a grid that knows the noise and
+takes the motion as exact (`infer` infers both, so that its intervals are wider). Before
 that the likelihood itself, at the grid's own noise, is set against the grid.
 """
 

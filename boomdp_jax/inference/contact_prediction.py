@@ -9,9 +9,9 @@ contact, and a step is taken in three parts: until just before it, a short one o
 and the rest; pairs that approach do not collide in a part in which they do not touch.
 Impacts that follow another one within a step are no better than the engine's.
 
-Whether bodies have collided at the end of a step depends on a hair's breadth, where they
-go afterwards does not. A filter that compares where neighbours of its estimate go would
-find that it knows nothing of the twists after such a step, so it asks whether the
+Whether bodies have collided by the end of a step may depend on a hair's breadth, where
+they go afterwards does not. A filter that compares where neighbours of its estimate go
+would find that it knows nothing of the twists after such a step; so it asks whether the
 estimate itself collides, and treats the neighbours alike (`first_impact`).
 
 Walls are bodies of the engine's scene, but not of the state: nothing reads where they
@@ -121,16 +121,24 @@ def contact_step(
     # Pairs that approach are left alone until then.
     is_lying = (times <= _EDGE * length) & ~impact | (times == NEVER)
     is_due = (times <= (cut + _REACH) * length) & has_impact
-    now = State(pose + shift * twist, twist)
-    now = _part(scene, params, now, wrench, (cut - _REACH) * length, is_lying)
-    is_hit = is_lying | is_due | impact
-    now = _part(scene, params, now, wrench, 2.0 * _REACH * length, is_hit)
-    rest = (1.0 - cut - _REACH) * length
-    times = _times(world, now.pose, now.twist, gain, rest)
-    is_last = (
-        (times <= _EDGE * length) | (times <= rest) & has_impact | (times == NEVER)
+    shares = jnp.stack(
+        [cut - _REACH, jnp.full_like(cut, 2.0 * _REACH), 1.0 - cut - _REACH]
     )
-    now = _part(scene, params, now, wrench, rest, is_last)
+    masks = jnp.stack([is_lying, is_lying | is_due | impact, is_lying])
+
+    def part(now: State, inputs: tuple) -> tuple[State, None]:
+        share, mask, is_rest = inputs
+        own, times = share * length, _times(world, now.pose, now.twist, gain, length)
+        is_next = (times <= own) & has_impact
+        is_last = (times <= _EDGE * length) | is_next | (times == NEVER)
+        mask = jnp.where(is_rest, is_last, mask)
+        here = eqx.tree_at(lambda s: s.collides, scene, scene.collides & mask)
+        return step(here, params, now, wrench, dt=own)[0], None
+
+    # As a loop: a step takes long to compile.
+    now = State(pose + shift * twist, twist)
+    inputs = (shares, masks, jnp.array([False, False, True]))
+    now, _ = jax.lax.scan(part, now, inputs)
     now = State(now.pose - shift * now.twist, now.twist)
     return now.array[: state.shape[0]]
 
@@ -167,7 +175,7 @@ def _impact(times: Float[Array, "all all"], length) -> Bool[Array, "all all"]:
 
 
 def _begin(world: ContactScene, params: Params, state, action, length) -> tuple:
-    """The block's bodies and walls: scene, params, pose, twist, wrench, acceleration."""
+    """Scene, params, pose, twist, wrench, acceleration of all bodies and walls."""
     num_walls = world.num_walls
     scene, params = world.scene, _with_walls(params, num_walls)
     pose = jnp.concatenate([state[:, :3], world.wall_pose.astype(state.dtype)])
@@ -180,13 +188,6 @@ def _times(world: ContactScene, pose, twist, gain, length) -> Float[Array, "all 
     """When pairs touch, with twists as they are on average until the end of a step."""
     free = jnp.where(world.scene.is_static[:, None], 0.0, twist + 0.5 * length * gain)
     return touch_times(world.scene, pose, free, world.sorts)
-
-
-def _part(scene: Scene, params: Params, state: State, wrench, length, may_touch):
-    """One part of a step, in which only some pairs collide."""
-    assert scene.collides is not None
-    scene = eqx.tree_at(lambda s: s.collides, scene, scene.collides & may_touch)
-    return step(scene, params, state, wrench, dt=length)[0]
 
 
 def _acceleration(

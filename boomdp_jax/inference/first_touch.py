@@ -23,13 +23,14 @@ from boomdp_jax.core.lanes import in_lanes
 from boomdp_jax.physics.scene import Scene
 
 NEVER, PARTING = 1e3, 2e3
-"""When outlines touch that neither approach nor part, and that part fast [s]."""
+"""When outlines touch that hardly move against each other, and that part [s]."""
 
 SLOW = 0.05
-"""Speed up to which outlines that part may lie on each other [m/s]."""
+"""Speed at which outlines approach or part, at least; up to it bodies that meet do not
+bounce, and may as well lie on each other [m/s]."""
 
 _NUM_NEWTON = 4
-# Speed below which outlines are not taken to approach [m/s].
+# Speed below which the search does not go on [m/s].
 _LEAST_SPEED = 1e-6
 _FAR = 1e9
 
@@ -78,8 +79,8 @@ def touch_times(
 
     Returns:
         Time from now of each pair, symmetric [s]; negative where outlines that approach
-        overlap already. `NEVER` where they do not approach, and for all other pairs;
-        `PARTING` where they part faster than `SLOW`.
+        overlap already. `NEVER` where they hardly move against each other and for all
+        other pairs, `PARTING` where they part.
     """
     table = jnp.full((scene.num_bodies, scene.num_bodies), NEVER, pose.dtype)
     if not sorts:
@@ -128,6 +129,7 @@ def _in_lanes(sorts, vertices, radius, pose, twist):
         start = jnp.zeros_like(sides[0].radius)
         rate = jax.jvp(apart, (start,), (jnp.ones_like(start),))[1]
         found, _ = jax.lax.scan(better, start, None, length=_NUM_NEWTON)
+        found = jnp.where(rate < -SLOW, found, NEVER)
         times.append(jnp.where(rate > SLOW, PARTING, found))
     return jnp.concatenate(times)
 

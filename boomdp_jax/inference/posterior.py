@@ -93,9 +93,8 @@ class Posterior(eqx.Module):
     prior_noise_scale: Float[Array, "prior_draw body 4"]
     """Prior draws of `noise_scale`."""
     inferred: dict[str, np.ndarray] = eqx.field(static=True, converter=_record)
-    """Which slots are inferred rather than known: revolute, distance and, where the
-    params have them, prismatic and weld `[joint]`, wheel `[body, wheel]`, ground
-    `[body, ground]`."""
+    """Which slots are inferred, not known, by kind: joints `[joint]`, wheel `[body,
+    wheel]`, ground `[body, ground]`."""
     spec: SceneSpec = eqx.field(static=True)
     """The scene that this is about; names the axes."""
     log_evidence: FloatScalar = eqx.field(converter=_scalar, default=float("nan"))
@@ -109,8 +108,8 @@ class Posterior(eqx.Module):
     seconds: dict = eqx.field(static=True, converter=_record, default_factory=dict)
     """Wall time spent on `compile` and on `run` [s]."""
     impulse_scale: Float[Array, "draw body 2"] | None = None
-    """Sd of the change of velocity [m/s] and spin [rad/s] that every step starts with:
-    noise of the motion itself. None where the method takes the motion as exact."""
+    """Sd of the change of velocity [m/s] and spin [rad/s] that every step starts with;
+    None where the method takes the motion as exact."""
     prior_impulse_scale: Float[Array, "prior_draw body 2"] | None = None
     """Prior draws of `impulse_scale`."""
     seed: int | None = eqx.field(static=True, default=None)

@@ -135,8 +135,9 @@ def _poses(spec: SceneSpec, history: History) -> tuple:
         )
     ]
     num = 2 * len(episode)
-    pose = np.stack([part[0] for part in parts], axis=1).reshape(num, -1, 3)
-    mask = np.stack([part[1] for part in parts], axis=1).reshape(num, -1, 3)
+    pose = np.stack([part[0] for part in parts], axis=1)
+    mask = np.stack([part[1] for part in parts], axis=1)
+    pose, mask = (x.reshape(num, spec.num_bodies, 3) for x in (pose, mask))
     seen = np.all(mask, axis=-1)
     for index, body in enumerate(spec.bodies):
         if body.is_static and body.pose is not None:
