@@ -291,8 +291,7 @@ class Posterior(eqx.Module):
         Returns:
             A `matplotlib.figure.Figure`.
         """
-        # Pictures lie layers above: looked up when asked for, so that nothing here
-        # depends on them.
+        # Pictures lie layers above, on which nothing here depends.
         viz = importlib.import_module("boomdp_jax.viz")
         return viz.plot_posterior(self, path, history=history)
 
@@ -302,10 +301,8 @@ class Posterior(eqx.Module):
 
     def save(self, path: str | os.PathLike) -> None:
         """Write an NPZ file with a JSON header that `load_posterior` reads."""
-        arrays = {
-            f"inferred.{kind}": np.asarray(slots, bool)
-            for kind, slots in self.inferred.items()
-        }
+        slots = self.inferred.items()
+        arrays = {f"inferred.{kind}": np.asarray(each, bool) for kind, each in slots}
         for name in _ARRAYS + _OPTIONAL:
             if getattr(self, name) is not None:
                 arrays[name] = np.asarray(getattr(self, name))
