@@ -204,7 +204,9 @@ def test_outlines_are_in_touch_when_they_first_touch(first, second):
     def distance(place):
         return separation(scene, State(place, jnp.zeros_like(place)))[0, 1]
 
-    time = jax.vmap(lambda p, v: touch_times(scene, p, v, sorts)[0, 1])(pose, twist)
+    time = jax.vmap(lambda p, v: touch_times(scene, p, v, 0.0 * v, sorts)[0, 1])(
+        pose, twist
+    )
     there = jax.vmap(distance)(pose + np.asarray(time)[:, None, None] * twist)
     # By half the way they are still apart: it is their first touch.
     half = jax.vmap(distance)(pose + 0.5 * np.asarray(time)[:, None, None] * twist)
@@ -220,7 +222,7 @@ def test_outlines_that_part_or_rest_do_not_touch():
 
     def time(speed):
         twist = jnp.zeros((2, 3)).at[1, 0].set(speed)
-        return float(touch_times(spec.scene, pose, twist, sorts)[0, 1])
+        return float(touch_times(spec.scene, pose, twist, 0.0 * twist, sorts)[0, 1])
 
     assert time(1.0) == PARTING
     assert time(0.0) == NEVER
