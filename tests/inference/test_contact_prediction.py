@@ -215,6 +215,16 @@ def test_outlines_are_in_touch_when_they_first_touch(first, second):
     assert np.all(np.asarray(half) > 1e-3)
 
 
+def test_gravity_is_counted_in_when_a_disc_falls():
+    spec = discs_spec(density=(1.0, 1.0))
+    sorts = sort_pairs([(0, 1)], np.array([True, True]))
+    pose = jnp.array([[0.0, 0.0, 0.0], [0.0, 0.2, 0.0]])
+    twist = jnp.zeros((2, 3)).at[1, 1].set(-0.5)
+    fall = jnp.zeros((2, 3)).at[1, 1].set(-9.81)
+    time = float(touch_times(spec.scene, pose, twist, fall, sorts)[0, 1])
+    assert 0.5 * time + 0.5 * 9.81 * time**2 == pytest.approx(0.2 - RADIUS.sum())
+
+
 def test_outlines_that_part_or_rest_do_not_touch():
     spec = discs_spec(density=(1.0, 1.0))
     sorts = sort_pairs([(0, 1)], np.array([True, True]))
