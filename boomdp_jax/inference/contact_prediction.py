@@ -109,7 +109,7 @@ def contact_step(
     """
     begin = _begin(world, params, state, action, length)
     scene, params, pose, twist, wrench, gain = begin
-    times = _times(world, pose, twist, gain, length)
+    times = _times(world, pose, twist, gain)
     if impact is None:
         impact = _impact(times, length)
     has_impact = jnp.any(impact)
@@ -128,7 +128,7 @@ def contact_step(
 
     def part(now: State, inputs: tuple) -> tuple[State, None]:
         share, mask, is_rest = inputs
-        own, times = share * length, _times(world, now.pose, now.twist, gain, length)
+        own, times = share * length, _times(world, now.pose, now.twist, gain)
         is_next = (times <= own) & has_impact
         is_last = (times <= _EDGE * length) | is_next | (times == NEVER)
         mask = jnp.where(is_rest, is_last, mask)
@@ -167,7 +167,7 @@ def first_impact(
         The pair, symmetric; none where nothing collides.
     """
     begin = _begin(world, params, state, action, length)
-    return _impact(_times(world, *begin[2:4], begin[5], length), length)
+    return _impact(_times(world, *begin[2:4], begin[5]), length)
 
 
 def _impact(times: Float[Array, "all all"], length) -> Bool[Array, "all all"]:
@@ -184,10 +184,10 @@ def _begin(world: ContactScene, params: Params, state, action, length) -> tuple:
     return scene, params, pose, twist, wrench, _acceleration(scene, params, wrench)
 
 
-def _times(world: ContactScene, pose, twist, gain, length) -> Float[Array, "all all"]:
-    """When pairs touch, with twists as they are on average until the end of a step."""
-    free = jnp.where(world.scene.is_static[:, None], 0.0, twist + 0.5 * length * gain)
-    return touch_times(world.scene, pose, free, world.sorts)
+def _times(world: ContactScene, pose, twist, gain) -> Float[Array, "all all"]:
+    """When pairs touch if nothing but forces and gravity acts."""
+    mobile = jnp.where(world.scene.is_static[:, None], 0.0, 1.0)
+    return touch_times(world.scene, pose, mobile * twist, mobile * gain, world.sorts)
 
 
 def _acceleration(

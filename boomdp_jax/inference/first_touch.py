@@ -1,11 +1,11 @@
 r"""When outlines that move first touch: Newton's method on their distance.
 
-With d(t) the distance of two outlines along a motion of constant twist,
+With d(t) the distance of two outlines along a motion of constant acceleration,
 $t \leftarrow t - d(t) / \dot d(t)$ from t = 0. For discs and for outlines that do not
-turn d is convex, and the iteration comes from below. The distance of two discs or of a
-disc and a polygon is that of their points; for two polygons it is the separating axis
-test, the largest gap along the normal of any edge, which is zero where they touch and
-otherwise no larger than their distance.
+turn, without acceleration, d is convex, and the iteration comes from below. The
+distance of two discs or of a disc and a polygon is that of their points; for two
+polygons it is the separating axis test, the largest gap along the normal of any edge,
+which is zero where they touch and otherwise no larger than their distance.
 
 All arrays are in lanes (`core.lanes`), pairs of a sort one below the other, `[pair,
 lane]`: in small trailing axes the same search costs ten times a step.
@@ -67,6 +67,7 @@ def touch_times(
     scene: Scene,
     pose: Float[Array, "body 3"],
     twist: Float[Array, "body 3"],
+    acceleration: Float[Array, "body 3"],
     sorts: tuple[PairSort, ...],
 ) -> Float[Array, "body body"]:
     """When bodies first touch, if nothing happens before.
@@ -75,6 +76,7 @@ def touch_times(
         scene: outlines.
         pose: where bodies are [m, m, rad].
         twist: with which they go on [m/s, m/s, rad/s].
+        acceleration: constant, of the same.
         sorts: which pairs.
 
     Returns:
@@ -86,7 +88,13 @@ def touch_times(
     if not sorts:
         return table
     found = in_lanes(
-        _in_lanes, scene.vertices, scene.radius, pose, twist, static=(sorts,)
+        _in_lanes,
+        scene.vertices,
+        scene.radius,
+        pose,
+        twist,
+        acceleration,
+        static=(sorts,),
     )
     pairs = [pair for sort in sorts for pair in sort.pairs]
     a, b = np.array(pairs, np.int32).T
@@ -99,12 +107,13 @@ class _Body(NamedTuple):
     place: tuple
     """x, y, theta."""
     twist: tuple
+    acceleration: tuple
     corners: list
     """In the body's frame."""
     radius: Any
 
 
-def _in_lanes(sorts, vertices, radius, pose, twist):
+def _in_lanes(sorts, vertices, radius, *motion):
     times = []
     for sort in sorts:
         sides = []
@@ -114,10 +123,8 @@ def _in_lanes(sorts, vertices, radius, pose, twist):
                 (vertices[index, i, 0], vertices[index, i, 1])
                 for i in range(vertices.shape[1])
             ]
-            place, speed = (
-                tuple(array[index, i] for i in range(3)) for array in (pose, twist)
-            )
-            sides.append(_Body(place, speed, corners, radius[index]))
+            moving = (tuple(array[index, i] for i in range(3)) for array in motion)
+            sides.append(_Body(*moving, corners, radius[index]))
         apart = functools.partial(_APART[sort.is_disc], *sides)
 
         def better(time, _, apart=apart):
@@ -135,7 +142,10 @@ def _in_lanes(sorts, vertices, radius, pose, twist):
 
 
 def _moved(body: _Body, time) -> tuple:
-    return tuple(p + time * v for p, v in zip(body.place, body.twist, strict=True))
+    return tuple(
+        place + time * (speed + 0.5 * time * rise)
+        for place, speed, rise in zip(*body[:3], strict=True)
+    )
 
 
 def _discs(a: _Body, b: _Body, time):

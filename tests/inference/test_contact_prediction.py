@@ -204,13 +204,25 @@ def test_outlines_are_in_touch_when_they_first_touch(first, second):
     def distance(place):
         return separation(scene, State(place, jnp.zeros_like(place)))[0, 1]
 
-    time = jax.vmap(lambda p, v: touch_times(scene, p, v, sorts)[0, 1])(pose, twist)
+    time = jax.vmap(lambda p, v: touch_times(scene, p, v, 0.0 * v, sorts)[0, 1])(
+        pose, twist
+    )
     there = jax.vmap(distance)(pose + np.asarray(time)[:, None, None] * twist)
     # By half the way they are still apart: it is their first touch.
     half = jax.vmap(distance)(pose + 0.5 * np.asarray(time)[:, None, None] * twist)
     assert np.all((np.asarray(time) > 0.0) & (np.asarray(time) < 0.3))
     np.testing.assert_allclose(there, 0.0, atol=1e-6)
     assert np.all(np.asarray(half) > 1e-3)
+
+
+def test_gravity_is_counted_in_when_a_disc_falls():
+    spec = discs_spec(density=(1.0, 1.0))
+    sorts = sort_pairs([(0, 1)], np.array([True, True]))
+    pose = jnp.array([[0.0, 0.0, 0.0], [0.0, 0.2, 0.0]])
+    twist = jnp.zeros((2, 3)).at[1, 1].set(-0.5)
+    fall = jnp.zeros((2, 3)).at[1, 1].set(-9.81)
+    time = float(touch_times(spec.scene, pose, twist, fall, sorts)[0, 1])
+    assert 0.5 * time + 0.5 * 9.81 * time**2 == pytest.approx(0.2 - RADIUS.sum())
 
 
 def test_outlines_that_part_or_rest_do_not_touch():
@@ -220,7 +232,7 @@ def test_outlines_that_part_or_rest_do_not_touch():
 
     def time(speed):
         twist = jnp.zeros((2, 3)).at[1, 0].set(speed)
-        return float(touch_times(spec.scene, pose, twist, sorts)[0, 1])
+        return float(touch_times(spec.scene, pose, twist, 0.0 * twist, sorts)[0, 1])
 
     assert time(1.0) == PARTING
     assert time(0.0) == NEVER
