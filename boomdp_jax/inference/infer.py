@@ -19,7 +19,9 @@ from boomdp_jax.inference.components import independent_blocks
 from boomdp_jax.inference.evidence_report import BlockResult
 from boomdp_jax.inference.fixed_structure import Structure
 from boomdp_jax.inference.nuts import run_nuts
-from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.outliers import outlier_reasons, without_isolated
+from boomdp_jax.inference.posterior import Posterior, with_diagnostics
+from boomdp_jax.inference.robust_update import DEGREES_OF_FREEDOM
 from boomdp_jax.inference.sample import sample_blocks
 from boomdp_jax.inference.structure_draws import SampleSettings
 from boomdp_jax.inference.svi import run_svi
@@ -27,6 +29,9 @@ from boomdp_jax.physics.scene_spec import SceneSpec
 
 METHODS = ("auto", "rj", "enumerate", "smc", "nuts", "svi", "laplace", "map")
 """Ways to infer: `auto` is `rj`."""
+
+OUTLIERS = {"none": None, "student-t": DEGREES_OF_FREEDOM}
+"""Degrees of freedom of the noise of readings; None: it is normal."""
 
 
 def infer(
@@ -36,6 +41,7 @@ def infer(
     *,
     method: str = "auto",
     structure: Structure | None = None,
+    outliers: str = "none",
     num_chains: int = 4,
     num_warmup: int = 200,
     num_samples: int = 500,
@@ -56,6 +62,10 @@ def infer(
             `nuts`, see `run_nuts`, and `svi`, see `run_svi`. `auto` is `rj`.
         structure: for `nuts` and `svi`: constraints that exist besides the known ones,
             such as `{"table": ["revolute"]}`; default: the most probable ones.
+        outliers: `none`: readings have normal noise, and the diagnostics say where some
+            are far off; `student-t`: they have Student-t noise of 4 degrees of freedom,
+            of which a few gross errors take little away. The noise reported is then its
+            scale. Not for `nuts` and `svi`.
         num_chains: chains, run side by side.
         num_warmup: iterations of each that adapt and are thrown away.
         num_samples: iterations of each that are kept. `enumerate` and `laplace` give
@@ -80,6 +90,7 @@ def infer(
         [history],
         method=method,
         structure=structure,
+        outliers=outliers,
         num_chains=num_chains,
         num_warmup=num_warmup,
         num_samples=num_samples,
@@ -95,6 +106,7 @@ def infer_batch(
     *,
     method: str = "auto",
     structure: Structure | None = None,
+    outliers: str = "none",
     num_chains: int = 4,
     num_warmup: int = 200,
     num_samples: int = 500,
@@ -112,6 +124,7 @@ def infer_batch(
         histories: one for each scene.
         method: as in `infer`.
         structure: as in `infer`, the same for all scenes.
+        outliers: as in `infer`.
         num_chains: as in `infer`.
         num_warmup: as in `infer`.
         num_samples: as in `infer`.
@@ -134,6 +147,12 @@ def infer_batch(
         )
     for spec, history in zip(specs, histories, strict=True):
         check_history(spec, history)
+    if outliers not in OUTLIERS:
+        raise ValueError(
+            f"outliers: expected one of {', '.join(OUTLIERS)}; got {outliers!r}"
+        )
+    if method in ("nuts", "svi") and outliers != "none":
+        raise ValueError(f"outliers: expected none with method {method!r}")
     if method not in ("nuts", "svi") and structure is not None:
         raise ValueError(f"structure: expected none with method {method!r}")
     with spread_over(mesh):
@@ -159,8 +178,24 @@ def infer_batch(
             method = "rj" if method == "auto" else method
             settings = SampleSettings(num_chains, num_warmup, num_samples)
             posteriors = _infer_structures(
-                key, specs, histories, settings, method=method, progress=progress
+                key,
+                specs,
+                histories,
+                settings,
+                method=method,
+                progress=progress,
+                freedom=OUTLIERS[outliers],
             )
+    if outliers == "none":
+        posteriors = [
+            with_diagnostics(posterior, reasons) if reasons else posterior
+            for posterior, reasons in zip(
+                posteriors, map(outlier_reasons, specs, histories), strict=True
+            )
+        ]
+    else:
+        law = {"degrees_of_freedom": OUTLIERS[outliers]}
+        posteriors = [with_diagnostics(posterior, (), law) for posterior in posteriors]
     seed = seed_of(key)
     return [dataclasses.replace(posterior, seed=seed) for posterior in posteriors]
 
@@ -173,15 +208,19 @@ def _infer_structures(
     *,
     method: str,
     progress: bool,
+    freedom: float | None,
 ) -> list[Posterior]:
     """Posteriors over structures, equal blocks of all scenes together."""
     start = time.perf_counter()
     histories = padded_histories(histories)
     problems, notes = [], []
     for index, (spec, history) in enumerate(zip(specs, histories, strict=True)):
-        blocks, screened = independent_blocks(spec, history)
+        trusted = history if freedom is None else without_isolated(history)
+        blocks, screened = independent_blocks(spec, trusted)
         notes.append(screened)
-        problems += [(index, make_block(spec, b, history)) for b in blocks]
+        problems += [
+            (index, make_block(spec, b, history, freedom=freedom)) for b in blocks
+        ]
     results: dict[int, list[BlockResult]] = {i: [] for i in range(len(specs))}
     groups = _group(problems)
     with CompileClock() as clock, _Bar(progress, len(problems)) as bar:
