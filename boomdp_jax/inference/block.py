@@ -13,6 +13,7 @@ from boomdp_jax.inference.coordinates import Coordinates, surroundings
 from boomdp_jax.inference.filtered_likelihood import FilteredLikelihood
 from boomdp_jax.inference.kalman import channel_scale
 from boomdp_jax.inference.layout import Layout, block_layout, structures
+from boomdp_jax.inference.outliers import without_isolated
 from boomdp_jax.inference.prior import prior_scales, read_prior
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.touching import Touching
@@ -43,6 +44,7 @@ def make_block(
     is_uniform: bool | None = None,
     weight: np.ndarray | None = None,
     touching: Touching | None = None,
+    freedom: float | None = None,
 ) -> Block:
     """Set up the posterior of a block.
 
@@ -57,6 +59,7 @@ def make_block(
         weight: as how many times its likelihood each row counts, `[time]`; default: as
             one.
         touching: what may have touched; None: nothing collides.
+        freedom: degrees of freedom of the readings' Student-t noise; None: normal.
 
     Returns:
         The block.
@@ -70,7 +73,8 @@ def make_block(
     rows, log_prior = structures(
         layout, spec.unknown, options, is_loaded=spec.normal_gravity > 0
     )
-    poses = _poses(history, bodies)
+    trusted = history if freedom is None else without_isolated(history)
+    poses = _poses(trusted, bodies)
     coordinates = Coordinates(
         layout=layout,
         scales=prior_scales(options),
@@ -83,7 +87,9 @@ def make_block(
     if is_uniform is None:
         dt = np.asarray(history.dt)[np.asarray(history.mask)]
         is_uniform = bool(dt.size == 0 or np.all(dt == dt[0]))
-    data = track_data(history, bodies, is_uniform, has_delay=layout.has_delay)
+    data = track_data(
+        history, bodies, is_uniform, has_delay=layout.has_delay, freedom=freedom
+    )
     if weight is not None:
         data = dataclasses.replace(data, weight=on_device(weight))
     scale = np.asarray(coordinates.scales.noise)

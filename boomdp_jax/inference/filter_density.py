@@ -16,8 +16,10 @@ from boomdp_jax.inference.kalman import (
     NoiseLevel,
     channel_scale,
     kick_scale,
+    start_factor,
     start_scale,
 )
+from boomdp_jax.inference.robust_update import correct_robustly, move
 from boomdp_jax.inference.track_data import TrackData, with_delay
 from boomdp_jax.inference.tracking import channel_difference, cloud_predictor
 from boomdp_jax.physics.params import Params
@@ -47,6 +49,7 @@ def filter_density(
     num_bodies = steps.state.shape[1]
     num = 6 * num_bodies
     scale = channel_scale(noise.reading).reshape(-1)
+    at_first = start_factor(data.freedom) * scale
     unknown = start_scale(num_bodies)
     variance, kick = scale**2, kick_scale(noise.impulse).reshape(-1) ** 2
     offsets = jnp.diag(scale).reshape(num, num_bodies, 6)
@@ -54,12 +57,12 @@ def filter_density(
     def advance(carry, row):
         state, covariance, total = carry
         seen = row.first_mask.reshape(-1)
-        at_start = jnp.diag(jnp.where(seen > 0, scale, unknown) ** 2)
+        at_start = jnp.diag(jnp.where(seen > 0, at_first, unknown) ** 2)
         state = jnp.where(row.is_start > 0, row.start, state)
         covariance = jnp.where(row.is_start > 0, at_start, covariance)
         miss = channel_difference(row.first, state).reshape(-1)
-        shift, covariance, first_density = correct(
-            covariance, miss, row.is_second * seen, variance
+        shift, covariance, first_density = _correct(
+            covariance, miss, row.is_second * seen, variance, data.freedom
         )
         state = state + shift.reshape(state.shape)
         points = jnp.concatenate([state[None], state[None] + offsets])
@@ -67,9 +70,16 @@ def filter_density(
         state = images[0]
         rise = (images[1:] - state[None]).reshape(num, num)
         miss = channel_difference(row.last, state).reshape(-1)
-        shift, covariance, last_density = move_and_correct(
-            covariance, rise, scale, kick, miss, row.last_mask.reshape(-1), variance
-        )
+        mask = row.last_mask.reshape(-1)
+        if data.freedom is None:
+            shift, covariance, last_density = move_and_correct(
+                covariance, rise, scale, kick, miss, mask, variance
+            )
+        else:
+            covariance = move(covariance, rise, scale, kick)
+            shift, covariance, last_density = _correct(
+                covariance, miss, mask, variance, data.freedom
+            )
         state = state + shift.reshape(state.shape)
         density = first_density + last_density
         density = density if row.weight is None else row.weight * density
@@ -77,3 +87,10 @@ def filter_density(
 
     carry = (jnp.zeros((num_bodies, 6)), jnp.eye(num), jnp.zeros(()))
     return jax.lax.scan(advance, carry, data.rows)[0][2]
+
+
+def _correct(covariance, miss, mask, variance, freedom: float | None):
+    """By normal or by Student-t noise: shift, covariance, log-density."""
+    if freedom is None:
+        return correct(covariance, miss, mask, variance)
+    return correct_robustly(covariance, miss, mask, variance, freedom)[:3]

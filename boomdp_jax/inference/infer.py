@@ -19,7 +19,9 @@ from boomdp_jax.inference.components import independent_blocks
 from boomdp_jax.inference.evidence_report import BlockResult
 from boomdp_jax.inference.fixed_structure import Structure
 from boomdp_jax.inference.nuts import run_nuts
-from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.outliers import outlier_reasons, without_isolated
+from boomdp_jax.inference.posterior import Posterior, with_diagnostics
+from boomdp_jax.inference.robust_update import DEGREES_OF_FREEDOM
 from boomdp_jax.inference.sample import sample_blocks
 from boomdp_jax.inference.structure_draws import SampleSettings
 from boomdp_jax.inference.svi import run_svi
@@ -29,6 +31,9 @@ from boomdp_jax.physics.scene_spec import SceneSpec
 METHODS = ("auto", "rj", "enumerate", "smc", "nuts", "svi", "laplace", "map")
 """Ways to infer: `auto` is `rj`."""
 
+OUTLIERS = {"none": None, "student-t": DEGREES_OF_FREEDOM}
+"""Degrees of freedom of the noise of readings; None: it is normal."""
+
 
 def infer(
     key: Key,
@@ -37,6 +42,7 @@ def infer(
     *,
     method: str = "auto",
     structure: Structure | None = None,
+    outliers: str = "none",
     num_chains: int = 4,
     num_warmup: int = 200,
     num_samples: int = 500,
@@ -57,6 +63,10 @@ def infer(
             `nuts`, see `run_nuts`, and `svi`, see `run_svi`. `auto` is `rj`.
         structure: for `nuts` and `svi`: constraints that exist besides the known ones,
             such as `{"table": ["revolute"]}`; default: the most probable ones.
+        outliers: `none`: readings have normal noise, and the diagnostics say where some
+            are far off; `student-t`: they have Student-t noise of 4 degrees of freedom,
+            of which a few gross errors take little away. The noise reported is then its
+            scale. Not for `nuts` and `svi`.
         num_chains: chains, run side by side.
         num_warmup: iterations of each that adapt and are thrown away.
         num_samples: iterations of each that are kept. `enumerate` and `laplace` give
@@ -81,6 +91,7 @@ def infer(
         [history],
         method=method,
         structure=structure,
+        outliers=outliers,
         num_chains=num_chains,
         num_warmup=num_warmup,
         num_samples=num_samples,
@@ -96,6 +107,7 @@ def infer_batch(
     *,
     method: str = "auto",
     structure: Structure | None = None,
+    outliers: str = "none",
     num_chains: int = 4,
     num_warmup: int = 200,
     num_samples: int = 500,
@@ -113,6 +125,7 @@ def infer_batch(
         histories: one for each scene.
         method: as in `infer`.
         structure: as in `infer`, the same for all scenes.
+        outliers: as in `infer`.
         num_chains: as in `infer`.
         num_warmup: as in `infer`.
         num_samples: as in `infer`.
@@ -135,6 +148,12 @@ def infer_batch(
         )
     for spec, history in zip(specs, histories, strict=True):
         check_history(spec, history)
+    if outliers not in OUTLIERS:
+        raise ValueError(
+            f"outliers: expected one of {', '.join(OUTLIERS)}; got {outliers!r}"
+        )
+    if method in ("nuts", "svi") and outliers != "none":
+        raise ValueError(f"outliers: expected none with method {method!r}")
     if method not in ("nuts", "svi") and structure is not None:
         raise ValueError(f"structure: expected none with method {method!r}")
     with spread_over(mesh):
@@ -160,8 +179,24 @@ def infer_batch(
             method = "rj" if method == "auto" else method
             settings = SampleSettings(num_chains, num_warmup, num_samples)
             posteriors = _infer_structures(
-                key, specs, histories, settings, method=method, progress=progress
+                key,
+                specs,
+                histories,
+                settings,
+                method=method,
+                progress=progress,
+                freedom=OUTLIERS[outliers],
             )
+    if outliers == "none":
+        posteriors = [
+            with_diagnostics(posterior, reasons) if reasons else posterior
+            for posterior, reasons in zip(
+                posteriors, map(outlier_reasons, specs, histories), strict=True
+            )
+        ]
+    else:
+        law = {"degrees_of_freedom": OUTLIERS[outliers]}
+        posteriors = [with_diagnostics(posterior, (), law) for posterior in posteriors]
     seed = seed_of(key)
     return [dataclasses.replace(posterior, seed=seed) for posterior in posteriors]
 
@@ -174,17 +209,22 @@ def _infer_structures(
     *,
     method: str,
     progress: bool,
+    freedom: float | None,
 ) -> list[Posterior]:
     """Posteriors over structures, equal blocks of all scenes together."""
     start = time.perf_counter()
     histories = padded_histories(histories)
     problems, notes = [], []
     for index, (spec, history) in enumerate(zip(specs, histories, strict=True)):
-        touching = find_touching(spec, history)
-        blocks, screened = independent_blocks(spec, history, touching)
+        trusted = history if freedom is None else without_isolated(history)
+        touching = find_touching(spec, trusted)
+        blocks, screened = independent_blocks(spec, trusted, touching)
         notes.append(screened)
         problems += [
-            (index, make_block(spec, bodies, history, touching=touching))
+            (
+                index,
+                make_block(spec, bodies, history, touching=touching, freedom=freedom),
+            )
             for bodies in blocks
         ]
     results: dict[int, list[BlockResult]] = {i: [] for i in range(len(specs))}

@@ -15,6 +15,7 @@ The derivative is by differences of about the readings' noise, which averages ov
 finer than that (a foot that sticks or slips).
 """
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -25,6 +26,7 @@ from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar
 from boomdp_jax.inference.contact_prediction import ContactScene
+from boomdp_jax.inference.robust_update import correct_robustly
 from boomdp_jax.inference.track_data import TrackData, TrackRow, with_delay
 from boomdp_jax.inference.tracking import Gains, channel_difference, cloud_predictor
 from boomdp_jax.physics.params import Params
@@ -90,6 +92,11 @@ def start_scale(num_bodies: int):
     return jnp.tile(jnp.asarray(_UNKNOWN_START), num_bodies)
 
 
+def start_factor(freedom: float | None) -> float:
+    """Sd over scale of the noise of a reading that a track starts from."""
+    return 1.0 if freedom is None else math.sqrt(freedom / (freedom - 2.0))
+
+
 class RowFilter:
     """Takes a hypothesis's estimate of the state from row to row."""
 
@@ -99,6 +106,7 @@ class RowFilter:
         params: Params,
         dt: Float[Array, " time"] | Float[Array, ""],
         noise: NoiseLevel,
+        freedom: float | None = None,
     ):
         """Work out what does not change from row to row.
 
@@ -107,7 +115,9 @@ class RowFilter:
             params: the hypothesis.
             dt: as `TrackData.steps` has it.
             noise: of readings and motion.
+            freedom: as `TrackData` has it.
         """
+        self._freedom = freedom
         num_bodies = noise.reading.shape[0]
         self._num = 6 * num_bodies
         self._predict = cloud_predictor(scene, params, dt)
@@ -124,7 +134,8 @@ class RowFilter:
     def __call__(self, before: Estimate, row: TrackRow) -> tuple[Estimate, FilteredRow]:
         """Filter one row."""
         begin, num = row.is_start > 0, self._num
-        first_sd = jnp.where(row.first_mask.reshape(-1) > 0, self._scale, self._unknown)
+        known = start_factor(self._freedom) * self._scale
+        first_sd = jnp.where(row.first_mask.reshape(-1) > 0, known, self._unknown)
         estimate = Estimate(
             jnp.where(begin, row.start, before.mean),
             jnp.where(begin, jnp.diag(first_sd**2), before.covariance),
@@ -149,13 +160,19 @@ class RowFilter:
         """One reading: new mean and covariance, gain, whitening, log-density."""
         state, covariance = estimate
         mask, num, variance = mask.reshape(-1), self._num, self._variance
+        miss = channel_difference(reading, state).reshape(-1) * mask
+        robust = None
+        if self._freedom is not None:
+            robust = correct_robustly(
+                covariance, miss, mask, self._scale**2, self._freedom
+            )
+            variance = jnp.diag(robust.variance)
         error = mask[:, None] * covariance * mask[None] + variance * mask[:, None]
         error = error + jnp.diag(1.0 - mask)
         factor = jnp.linalg.cholesky(error)
         whitening = jax.scipy.linalg.solve_triangular(factor, jnp.eye(num), lower=True)
         gain = (covariance * mask[None]) @ (whitening.T @ whitening)
         whitening = mask[:, None] * whitening * mask[None]
-        miss = channel_difference(reading, state).reshape(-1) * mask
         rest = jnp.eye(num) - gain * mask[None]
         covariance = rest @ covariance @ rest.T + gain @ variance @ gain.T
         state = state + (gain @ miss).reshape(state.shape)
@@ -164,6 +181,10 @@ class RowFilter:
             jnp.where(diagonal > 0, jnp.log(jnp.where(diagonal > 0, diagonal, 1.0)), 0)
         ) - 0.5 * jnp.sum((whitening @ miss) ** 2)
         log_density = log_density - 0.5 * jnp.sum(mask) * jnp.log(2.0 * jnp.pi)
+        if robust is not None:
+            state, _ = estimate
+            state = state + robust.shift.reshape(state.shape)
+            covariance, log_density = robust.covariance, robust.log_density
         return Estimate(state, covariance), gain, whitening, log_density
 
 
@@ -185,7 +206,7 @@ def extended_filter(
         Gains, and the log-density of all readings but the first of each track, each
         row's as often as the row counts.
     """
-    row_filter = RowFilter(scene, params, data.steps.dt, noise)
+    row_filter = RowFilter(scene, params, data.steps.dt, noise, data.freedom)
     data = with_delay(params, data)
 
     def advance(carry, row):

@@ -34,7 +34,9 @@ class NoiseFit(NamedTuple):
     @classmethod
     def of_vector(cls, vector: np.ndarray) -> "NoiseFit":
         """From logarithms `[point, number]`."""
-        both = np.exp(vector).reshape(len(vector), -1, NUM_EACH)
+        # Far beyond any noise, and still a number in single precision.
+        both = np.exp(np.clip(vector, -80.0, 80.0))
+        both = both.reshape(len(vector), -1, NUM_EACH)
         return cls(both[..., :4], both[..., 4:])
 
     def take(self, rows: np.ndarray) -> "NoiseFit":

@@ -118,6 +118,11 @@ class Posterior(eqx.Module):
     )
 
     @property
+    def degrees_of_freedom(self) -> float | None:
+        """Of Student-t noise of scale `noise_scale`; None: it is normal."""
+        return self.diagnostics.get("degrees_of_freedom")
+
+    @property
     def num_draws(self) -> int:
         """How many draws there are."""
         return self.log_weight.shape[0]
@@ -246,9 +251,8 @@ class Posterior(eqx.Module):
 
         Φ, σ ~ P(·|h); the state is stepped under Φ, after an impulse where the motion
         has noise of its own; noise of scale σ is added. Every call draws a new
-        hypothesis; a planner that keeps one down its tree takes it from
-        `sample_params`. Where commands have a delay, the wrench is the command that is
-        in effect (`delayed_wrenches`).
+        hypothesis; a planner that keeps one takes it from `sample_params`. Where
+        commands have a delay, the wrench is that in effect (`delayed_wrenches`).
 
         Args:
             key: random key.
@@ -269,7 +273,8 @@ class Posterior(eqx.Module):
         params = self.spec.with_surface(params)
         state = add_impulse(kick_key, state, impulse_scale, scene.is_static)
         next_state, _ = step(scene, params, state, wrench)
-        return add_reading_noise(noise_key, next_state, noise_scale, scene.is_static)
+        law = (noise_scale, scene.is_static, self.degrees_of_freedom)
+        return add_reading_noise(noise_key, next_state, *law)
 
     def predict(
         self, history: History, horizons: Iterable[int] = (1, 10, 50), **options: Any

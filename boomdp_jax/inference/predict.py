@@ -86,6 +86,7 @@ def predict(
         history,
         _in_effect(kept.params, history),
         tuple(horizons),
+        posterior.degrees_of_freedom,
     )
     moments = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), moments)
     table = jax.tree.map(np.asarray, history)
@@ -110,6 +111,7 @@ def sample_readings(
     dt: Float[Array, "draw time"],
     places: Int[Array, " place"],
     impulse_scale: Float[Array, "draw body 2"] | None = None,
+    freedom: float | None = None,
 ) -> Float[Array, "draw place body 6"]:
     """Draw what may be read later, one trajectory for each hypothesis.
 
@@ -123,13 +125,14 @@ def sample_readings(
         dt: lengths of the steps [s].
         places: after which steps to read, counted from 0.
         impulse_scale: noise of the motion [m/s, rad/s]; None: it has none.
+        freedom: degrees of freedom of the readings' Student-t noise; None: normal.
 
     Returns:
         Readings at those places.
     """
     start_key, end_key, kick_key = jax.random.split(key, 3)
     start = add_reading_noise(
-        start_key, state_from_array(reading), noise_scale, scene.is_static
+        start_key, state_from_array(reading), noise_scale, scene.is_static, freedom
     )
 
     def advance(params, state, wrenches, dt, impulse_scale, key):
@@ -144,7 +147,7 @@ def sample_readings(
     keys = jax.random.split(kick_key, len(reading))
     states = jax.vmap(advance)(params, start, wrenches, dt, impulse_scale, keys)
     return add_reading_noise(
-        end_key, states, noise_scale[:, None], scene.is_static
+        end_key, states, noise_scale[:, None], scene.is_static, freedom
     ).array
 
 
@@ -161,7 +164,7 @@ def _rollout_with_impulses(key, scene, params, state, wrenches, dt, impulse_scal
     return jax.lax.scan(advance, state, (keys, wrenches, dt))[1]
 
 
-@functools.partial(jax.jit, static_argnames=("horizons",))
+@functools.partial(jax.jit, static_argnames=("horizons", "freedom"))
 def _predict_rows(
     key: Key,
     scene: Scene,
@@ -171,6 +174,7 @@ def _predict_rows(
     history: History,
     actions: Float[Array, "draw time body 3"] | None,
     horizons: tuple[int, ...],
+    freedom: float | None,
 ) -> dict[str, Float[Array, "time horizon body 6"]]:
     """Moments and interval of the predictive distribution from every row.
 
@@ -202,6 +206,7 @@ def _predict_rows(
             history.dt[following],
             places,
             None if impulse_scale is None else impulse_scale[draw],
+            freedom,
         ).reshape(num_starts, num_draws, *places.shape, -1, 6)
         low, high = jnp.quantile(readings, jnp.array([0.05, 0.95]), axis=1)
         return {

@@ -13,6 +13,7 @@ def add_reading_noise(
     state: State,
     noise_scale: Float[Array, "*#batch body 4"],
     is_static: Bool[Array, " body"],
+    freedom: float | None = None,
 ) -> State:
     """Add independent noise to readings; a static body has none.
 
@@ -21,6 +22,8 @@ def add_reading_noise(
         state: true poses and twists.
         noise_scale: sd of position [m], angle [rad], velocity [m/s], spin [rad/s].
         is_static: which bodies are part of the room.
+        freedom: degrees of freedom of Student-t noise, whose scale `noise_scale` then
+            is; None: it is normal.
 
     Returns:
         The readings.
@@ -29,7 +32,10 @@ def add_reading_noise(
     scale = noise_scale[..., jnp.array([0, 0, 1, 2, 2, 3])]
     scale = jnp.broadcast_to(scale, truth.shape)
     scale = jnp.where(jnp.broadcast_to(is_static[:, None], truth.shape), 0.0, scale)
-    noise = jax.random.normal(key, truth.shape, truth.dtype)
+    if freedom is None:
+        noise = jax.random.normal(key, truth.shape, truth.dtype)
+    else:
+        noise = jax.random.t(key, freedom, truth.shape, truth.dtype)
     return state_from_array(truth + scale * noise)
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from boomdp_jax.core.arrays import on_device
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.one_step import Readings, in_effect, readings
+from boomdp_jax.inference.outliers import without_isolated
 from boomdp_jax.physics.params import Params
 
 
@@ -49,6 +50,8 @@ class TrackData(eqx.Module):
     """Where a track would start in each row: readings, or a guess where missing."""
     weight: Float[Array, " time"] | None = None
     """As how many times its likelihood each row counts; None: as one."""
+    freedom: float | None = eqx.field(static=True, default=None)
+    """Degrees of freedom of the readings' Student-t noise; None: it is normal."""
 
     @property
     def rows(self) -> TrackRow:
@@ -80,6 +83,7 @@ def track_data(
     is_uniform: bool,
     *,
     has_delay: bool = False,
+    freedom: float | None = None,
 ) -> TrackData:
     """Take a block's bodies out of a history.
 
@@ -88,13 +92,17 @@ def track_data(
         bodies: indices of the block's bodies.
         is_uniform: whether all steps are equally long.
         has_delay: whether commands may take effect later than they were given.
+        freedom: degrees of freedom of the readings' noise; None: it is normal. Readings
+            far from their neighbours are then not started from, nor stepped from one
+            by one.
 
     Returns:
         The readings. A missing first reading of a track is replaced by the mean
         position, or by rest; how little is known of it is up to the filter.
     """
     index = np.asarray(bodies)
-    steps = readings(history, bodies, is_uniform, has_delay=has_delay)
+    trusted = history if freedom is None else without_isolated(history)
+    steps = readings(trusted, bodies, is_uniform, has_delay=has_delay)
     dtype = steps.state.dtype
     state, rows = np.asarray(steps.state), np.asarray(history.mask)
     first = np.asarray(history.state_mask)[:, index] & rows[:, None, None]
@@ -103,6 +111,9 @@ def track_data(
     same = np.zeros(rows.shape, bool)
     same[1:] = (episode[1:] == episode[:-1]) & rows[:-1]
     goes_on = rows & same
+    if freedom is not None:
+        seen = np.asarray(trusted.state_mask)[:, index]
+        first &= seen | goes_on[:, None, None]
     num = np.maximum(np.sum(first, axis=0), 1)
     mean = np.sum(np.where(first, state, 0.0), axis=0) / num
     guess = np.where(np.arange(6)[None] < 3, mean, 0.0)
@@ -113,4 +124,5 @@ def track_data(
         is_start=on_device(~goes_on, dtype),
         is_second=on_device(goes_on & ~np.asarray(history.is_chained), dtype),
         start=on_device(np.where(first, state, guess[None]), dtype),
+        freedom=freedom,
     )
