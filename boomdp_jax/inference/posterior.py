@@ -248,9 +248,9 @@ class Posterior(eqx.Module):
         """Draw the next reading: the paper's generative process, one call.
 
         Φ, σ ~ P(·|h); the state is stepped under Φ, after an impulse where the motion
-        has noise of its own; noise of scale σ is added. Every call draws a new
-        hypothesis; a planner that keeps one takes it from `sample_params`. Where
-        commands have a delay, the wrench is that in effect (`delayed_wrenches`).
+        has noise of its own; noise of scale σ is added. Every call draws a hypothesis;
+        a planner that keeps one takes it from `sample_params`. Where commands have a
+        delay, the wrench is that in effect (`delayed_wrenches`).
 
         Args:
             key: random key.
