@@ -15,8 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from boomdp_jax.core.arrays import FloatScalar, Key
 from boomdp_jax.core.history import History
-from boomdp_jax.inference.body_numbers import get_number
-from boomdp_jax.inference.layout import BODY_NUMBERS
+from boomdp_jax.inference.body_numbers import inferred_numbers
 from boomdp_jax.inference.posterior_file import (
     read_posterior_file,
     write_posterior_file,
@@ -156,11 +155,7 @@ class Posterior(eqx.Module):
                 np.asarray(params.density),
                 weights,
                 np.asarray(prior.density),
-                {
-                    name: (get_number(params, name), get_number(prior, name))
-                    for name in BODY_NUMBERS
-                    if get_number(params, name) is not None
-                },
+                inferred_numbers(params, prior),
             ),
             "structure": report_structures(
                 self.spec, params, weights, prior, self.inferred
