@@ -36,6 +36,15 @@ def get_number(params: Params, name: str) -> Any:
     return owner
 
 
+def inferred_numbers(params: Params, prior_params: Params) -> dict[str, tuple]:
+    """What is inferred of bodies, by name: draws and prior draws."""
+    return {
+        name: (get_number(params, name), get_number(prior_params, name))
+        for name in BODY_NUMBERS
+        if get_number(params, name) is not None
+    }
+
+
 def with_numbers(params: Params, numbers: Mapping[str, Any]) -> Params:
     """Params with numbers of bodies.
 

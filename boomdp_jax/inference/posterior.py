@@ -15,9 +15,8 @@ from jaxtyping import Array, Float, Int
 
 from boomdp_jax.core.arrays import FloatScalar, Key
 from boomdp_jax.core.history import History
-from boomdp_jax.inference.body_numbers import get_number
+from boomdp_jax.inference.body_numbers import inferred_numbers
 from boomdp_jax.inference.contact_numbers import report_contact
-from boomdp_jax.inference.layout import BODY_NUMBERS
 from boomdp_jax.inference.posterior_file import (
     read_posterior_file,
     write_posterior_file,
@@ -157,11 +156,7 @@ class Posterior(eqx.Module):
                 np.asarray(params.density),
                 weights,
                 np.asarray(prior.density),
-                {
-                    name: (get_number(params, name), get_number(prior, name))
-                    for name in BODY_NUMBERS
-                    if get_number(params, name) is not None
-                },
+                inferred_numbers(params, prior),
             ),
             "structure": report_structures(
                 self.spec, params, weights, prior, self.inferred
@@ -250,9 +245,9 @@ class Posterior(eqx.Module):
         """Draw the next reading: the paper's generative process, one call.
 
         Φ, σ ~ P(·|h); the state is stepped under Φ, after an impulse where the motion
-        has noise of its own; noise of scale σ is added. Every call draws a new
-        hypothesis; a planner that keeps one takes it from `sample_params`. Where
-        commands have a delay, the wrench is that in effect (`delayed_wrenches`).
+        has noise of its own; noise of scale σ is added. Every call draws a hypothesis;
+        a planner that keeps one takes it from `sample_params`. Where commands have a
+        delay, the wrench is that in effect (`delayed_wrenches`).
 
         Args:
             key: random key.
