@@ -19,7 +19,7 @@ from boomdp_jax.inference.components import independent_blocks
 from boomdp_jax.inference.evidence_report import BlockResult
 from boomdp_jax.inference.fixed_structure import Structure
 from boomdp_jax.inference.nuts import run_nuts
-from boomdp_jax.inference.outliers import outlier_reasons, without_isolated
+from boomdp_jax.inference.outliers import outlier_notes, without_isolated
 from boomdp_jax.inference.posterior import Posterior, with_diagnostics
 from boomdp_jax.inference.robust_update import DEGREES_OF_FREEDOM
 from boomdp_jax.inference.sample import sample_blocks
@@ -63,10 +63,10 @@ def infer(
             `nuts`, see `run_nuts`, and `svi`, see `run_svi`. `auto` is `rj`.
         structure: for `nuts` and `svi`: constraints that exist besides the known ones,
             such as `{"table": ["revolute"]}`; default: the most probable ones.
-        outliers: `none`: readings have normal noise, and the diagnostics say where some
-            are far off; `student-t`: they have Student-t noise of 4 degrees of freedom,
-            of which a few gross errors take little away. The noise reported is then its
-            scale. Not for `nuts` and `svi`.
+        outliers: `none`: readings have normal noise, and `diagnostics["notes"]` say
+            where some are far off; `student-t`: they have Student-t noise of 4 degrees
+            of freedom, of which a few gross errors take little away. The noise reported
+            is then its scale. Not for `nuts` and `svi`.
         num_chains: chains, run side by side.
         num_warmup: iterations of each that adapt and are thrown away.
         num_samples: iterations of each that are kept. `enumerate` and `laplace` give
@@ -189,9 +189,9 @@ def infer_batch(
             )
     if outliers == "none":
         posteriors = [
-            with_diagnostics(posterior, reasons) if reasons else posterior
-            for posterior, reasons in zip(
-                posteriors, map(outlier_reasons, specs, histories), strict=True
+            _with_notes(posterior, outlier_notes(spec, history))
+            for posterior, spec, history in zip(
+                posteriors, specs, histories, strict=True
             )
         ]
     else:
@@ -199,6 +199,13 @@ def infer_batch(
         posteriors = [with_diagnostics(posterior, (), law) for posterior in posteriors]
     seed = seed_of(key)
     return [dataclasses.replace(posterior, seed=seed) for posterior in posteriors]
+
+
+def _with_notes(posterior: Posterior, notes: list[str]) -> Posterior:
+    if not notes:
+        return posterior
+    before = posterior.diagnostics.get("notes", [])
+    return with_diagnostics(posterior, (), {"notes": [*before, *notes]})
 
 
 def _infer_structures(

@@ -275,6 +275,7 @@ def format_report(report: dict, structures: dict[str, float], num_draws: int) ->
     diagnostics = report["diagnostics"]
     reasons = "; ".join(diagnostics["reasons"])
     lines.append(f"diagnostics   {'ok' if diagnostics['ok'] else 'NOT OK: ' + reasons}")
+    lines += [f"note          {note}" for note in diagnostics.get("notes", [])]
     return "\n".join(lines)
 
 

@@ -10,7 +10,7 @@ import boomdp_jax
 from boomdp_jax.core.history import History, make_history
 from boomdp_jax.inference.filter_density import filter_density
 from boomdp_jax.inference.kalman import NoiseLevel, extended_filter
-from boomdp_jax.inference.outliers import isolated_readings, outlier_reasons
+from boomdp_jax.inference.outliers import isolated_readings, outlier_notes
 from boomdp_jax.inference.random_motion import add_reading_noise
 from boomdp_jax.inference.robust_update import correct_robustly, scale_nodes
 from boomdp_jax.inference.track_data import track_data
@@ -203,16 +203,16 @@ def test_spikes_are_found_and_impacts_are_not():
     assert list(zip(*np.nonzero(last[:, 0]), strict=True)) == expected
 
 
-def test_normal_noise_gives_no_warning_and_gross_errors_one():
+def test_normal_noise_gives_no_note_and_gross_errors_one():
     rng = np.random.default_rng(3)
     clean = free_box(rng, 100)
-    assert outlier_reasons(box_scene(), clean) == []
-    (reason,) = outlier_reasons(box_scene(), spoilt(rng, clean, 0.05))
-    assert reason.startswith("box: ")
-    assert "outliers='student-t'" in reason
+    assert outlier_notes(box_scene(), clean) == []
+    (note,) = outlier_notes(box_scene(), spoilt(rng, clean, 0.05))
+    assert note.startswith("box: ")
+    assert "outliers='student-t'" in note
     nothing = np.zeros((0, 1, 6))
     empty = make_history(nothing, nothing[..., :3], nothing, DT)
-    assert outlier_reasons(box_scene(), empty) == []
+    assert outlier_notes(box_scene(), empty) == []
 
 
 def test_a_track_does_not_start_from_a_gross_error():
@@ -258,7 +258,7 @@ def test_settings_that_make_no_sense_are_refused():
 
 
 @pytest.mark.slow
-def test_masses_stay_right_with_gross_errors_and_the_default_warns():
+def test_masses_stay_right_with_gross_errors_and_the_default_says_so():
     """Errors over sds of twenty masses; bound of a chi-square, one in a thousand.
 
     There is no lower bound: where the motion has no noise of its own, not knowing so
@@ -287,6 +287,7 @@ def test_masses_stay_right_with_gross_errors_and_the_default_warns():
     wide = [p.to_json()["bodies"]["box"]["mass"]["sd"] for p in plain]
     assert np.median(wide) > 10.0 * spread
     for posterior in plain:
-        assert "student-t" in "; ".join(posterior.diagnostics["reasons"])
+        assert "student-t" in "; ".join(posterior.diagnostics["notes"])
+        assert "student-t" in posterior.summary()
     assert all(p.degrees_of_freedom == FREEDOM for p in robust)
     assert all(p.degrees_of_freedom is None for p in plain)
