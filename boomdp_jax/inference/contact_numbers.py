@@ -1,6 +1,7 @@
 """Friction and restitution of contact that a scene leaves open: draws and reports."""
 
 import dataclasses
+import itertools
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,9 @@ from boomdp_jax.inference.touching import CONTACT_NUMBERS, unknown_contact
 from boomdp_jax.physics.params import Params, Surface
 from boomdp_jax.physics.scene_arrays import build_surface
 from boomdp_jax.physics.scene_spec import SceneSpec
+
+MOST_RATIOS = 15
+"""Pairs of bodies whose ratios are reported."""
 
 _SCALES: dict[str, Scale] = {"friction": "log", "restitution": "logit"}
 
@@ -75,6 +79,28 @@ def _prior_draws(
     return 1.0 / (1.0 + np.exp(-scale.center - normal))
 
 
+def report_collisions(
+    spec: SceneSpec, params: Params, weights: np.ndarray, prior_params: Params
+) -> dict:
+    """What a report says of contact, entries with something to say alone.
+
+    Args:
+        spec: the scene.
+        params: draws, NumPy arrays with a leading draw axis.
+        weights: of the draws, sum to one, `[draw]`.
+        prior_params: prior draws.
+
+    Returns:
+        `contact` and `mass_ratios`, see `report_contact` and `report_mass_ratios`.
+    """
+    arguments = spec, params, weights, prior_params
+    report = {
+        "contact": report_contact(*arguments),
+        "mass_ratios": report_mass_ratios(*arguments),
+    }
+    return {name: entry for name, entry in report.items() if entry}
+
+
 def report_contact(
     spec: SceneSpec, params: Params, weights: np.ndarray, prior_params: Params
 ) -> dict:
@@ -105,3 +131,54 @@ def report_contact(
         found = summarise(value, weights, prior, _SCALES[name])
         report[name] = {"bodies": names, **found}
     return report
+
+
+def report_mass_ratios(
+    spec: SceneSpec, params: Params, weights: np.ndarray, prior_params: Params
+) -> list[dict]:
+    """Ratios of masses of bodies that can collide.
+
+    A collision without a force tells ratios and no mass: each mass then stays nearly as
+    uncertain as before, and neither says how well the ratio is known.
+
+    Args:
+        spec: the scene.
+        params: draws, NumPy arrays with a leading draw axis.
+        weights: of the draws, sum to one, `[draw]`.
+        prior_params: prior draws.
+
+    Returns:
+        A summary of each pair of bodies of which at least one density is unknown, by
+        the order of the scene; empty where nothing collides, or where there are more
+        than `MOST_RATIOS` of them.
+    """
+    movable = [
+        index
+        for index, body in enumerate(spec.bodies)
+        if body.has_contact and not body.is_static
+    ]
+    pairs = [
+        (i, j)
+        for i, j in itertools.combinations(movable, 2)
+        if spec.bodies[i].density is None or spec.bodies[j].density is None
+    ]
+    if len(pairs) > MOST_RATIOS:
+        return []
+    report = []
+    for i, j in pairs:
+        ratio, prior = (
+            _masses(spec, draws, i) / _masses(spec, draws, j)
+            for draws in (params, prior_params)
+        )
+        found = summarise(ratio, weights, prior, "log")
+        report.append({"bodies": [spec.names[i], spec.names[j]], **found})
+    return report
+
+
+def _masses(spec: SceneSpec, draws: Params, index: int) -> np.ndarray:
+    """Mass of a body by draw; as the scene has it where it knows the density."""
+    body = spec.bodies[index]
+    density = np.asarray(draws.density, float)[:, index]
+    if body.density is not None:
+        density = np.full_like(density, body.density)
+    return density * body.area

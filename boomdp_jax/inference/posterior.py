@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from boomdp_jax.core.arrays import FloatScalar, Key
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.body_numbers import inferred_numbers
-from boomdp_jax.inference.contact_numbers import report_contact
+from boomdp_jax.inference.contact_numbers import report_collisions
 from boomdp_jax.inference.posterior_file import (
     read_posterior_file,
     write_posterior_file,
@@ -145,7 +145,8 @@ class Posterior(eqx.Module):
         Static bodies are left out. Anchors and wheel poses are in the frame of the
         outline as authored. `known_constraints` lists constraints that the scene file
         states with a number left open; `contact` is there where friction or restitution
-        of contact is inferred. What is not finite is None.
+        of contact is inferred, `mass_ratios` where bodies can collide. What is not
+        finite is None.
         """
         params, prior = _on_host(self.params), _on_host(self.prior_params)
         weights = self.weights
@@ -164,7 +165,7 @@ class Posterior(eqx.Module):
             "known_constraints": report_known(
                 self.spec, params, weights, prior, self.inferred
             ),
-            **_if_any("contact", report_contact(self.spec, params, weights, prior)),
+            **report_collisions(self.spec, params, weights, prior),
             "noise": report_noise(
                 self.spec,
                 np.asarray(self.noise_scale, np.float64),
@@ -379,10 +380,6 @@ def load_posterior(path: str | os.PathLike) -> Posterior:
         if name.startswith("inferred.")
     }
     return Posterior(params=params, prior_params=prior_params, spec=spec, **fields)
-
-
-def _if_any(name: str, entry: dict) -> dict:
-    return {name: entry} if entry else {}
 
 
 def _double(array: Array | None) -> np.ndarray | None:

@@ -261,6 +261,11 @@ def format_report(report: dict, structures: dict[str, float], num_draws: int) ->
     for name, number in report.get("contact", {}).items():
         bodies = ", ".join(number["bodies"])
         lines.append(f"  {name:<20}{_quantity(number, [''])} ({bodies})")
+    if "mass_ratios" in report:
+        lines += ["", "ratios of masses"]
+    for ratio in report.get("mass_ratios", []):
+        name = " / ".join(ratio["bodies"])
+        lines.append(f"  {name:<20}{_quantity(ratio, [''])}")
     lines += ["", "noise of one reading (sd)"]
     for name, noise in report["noise"].items():
         parts = [

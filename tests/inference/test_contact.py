@@ -271,6 +271,39 @@ def test_reports_say_what_is_known_of_contact():
     assert "(prior)" not in lines[place + 2]
 
 
+def test_a_ratio_of_masses_is_known_where_the_masses_are_not():
+    """Masses by a common unknown factor: their ratio is 2 to one part in a hundred."""
+    rng = np.random.default_rng(4)
+    spec = discs_spec(contact=GIVEN)
+    area = [body.area for body in spec.bodies]
+
+    def with_masses(first, second):
+        params = jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, (len(first), *leaf.shape)),
+            empty_params(2),
+        )
+        density = np.stack([first / area[0], second / area[1]], axis=1)
+        return dataclasses.replace(params, density=jnp.asarray(density))
+
+    factor = np.exp(1.5 * rng.standard_normal(500))
+    ratio = 2.0 * np.exp(0.01 * rng.standard_normal(500))
+    prior = np.exp(1.5 * rng.standard_normal((2, 1000)))
+    posterior = make_posterior(
+        spec, with_masses(ratio * factor, factor), with_masses(*prior)
+    )
+    (found,) = posterior.to_json()["mass_ratios"]
+    assert found["bodies"] == ["a", "b"]
+    assert found["identified"]
+    assert found["q50"] == pytest.approx(2.0, rel=2e-3)
+    assert found["sd"] == pytest.approx(0.02, rel=0.15)
+    lines = posterior.summary().splitlines()
+    assert lines[lines.index("ratios of masses") + 1].startswith("  a / b")
+    known = dataclasses.replace(
+        posterior, spec=discs_spec(contact=GIVEN, density=(1.0, 2.0))
+    )
+    assert "mass_ratios" not in known.to_json()
+
+
 def test_reports_of_scenes_without_open_contact_say_nothing_of_it():
     posterior = known_contact()
     posterior = dataclasses.replace(posterior, spec=discs_spec(contact=GIVEN))
