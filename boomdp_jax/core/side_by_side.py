@@ -19,13 +19,16 @@ import jax.numpy as jnp
 _compiled: set[object] = set()
 
 
+def num_threads() -> int:
+    """How many calls are made at a time: one for each core of this process."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 @functools.cache
 def _pool() -> concurrent.futures.ThreadPoolExecutor:
-    return concurrent.futures.ThreadPoolExecutor(
-        len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else (os.cpu_count() or 1)
-    )
+    return concurrent.futures.ThreadPoolExecutor(num_threads())
 
 
 def forget_compiled() -> None:

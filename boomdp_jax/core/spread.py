@@ -23,7 +23,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh
 
 from boomdp_jax.core.quick_compile import QuickCompile
-from boomdp_jax.core.side_by_side import call_each
+from boomdp_jax.core.side_by_side import call_each, num_threads
 
 
 class Program:
@@ -95,6 +95,12 @@ def is_spread() -> bool:
     return _over.get() is not None
 
 
+def num_at_a_time() -> int:
+    """How many calls `run_each` makes at the same time."""
+    over = _over.get()
+    return num_threads() if over is None else over.num_devices
+
+
 class _Over:
     """The devices of a mesh, and what has been copied to those of this process."""
 
@@ -122,6 +128,11 @@ class _Over:
         # of calls for the same targets.
         self._source: list[Any] = []
         self._copies: dict[jax.Device | None, Any] = {}
+
+    @property
+    def num_devices(self) -> int:
+        """Of the whole mesh."""
+        return len(self._devices)
 
     def run(self, program: Program, shared: Any, inputs: Sequence[tuple]) -> list[Any]:
         """As `run_each` does; with several processes each device gets as many calls."""

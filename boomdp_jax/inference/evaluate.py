@@ -1,10 +1,9 @@
 """Likelihoods of many points of many objects, by one compiled program.
 
 Points come as a flat list on the host. They are sorted into chunks of equal object and
-structure (`chunking`), so that data and gains are read once for a chunk and products
-with gains vectorise, and handed out in calls of one size, as many at a time as there
-are cores: whatever is fitted, weighed or sampled, and however many objects there are,
-the physics is compiled once.
+structure (`chunking`) and handed out in calls of one program, as many at a time as
+there are cores: whatever is fitted, weighed or sampled, and however many objects there
+are, the physics is compiled once.
 """
 
 from typing import Any, NamedTuple
@@ -13,8 +12,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from boomdp_jax.core.spread import Program, run_each
-from boomdp_jax.inference.chunking import Chunking
+from boomdp_jax.core.spread import Program, num_at_a_time, run_each
+from boomdp_jax.inference.chunking import Chunking, for_each_chunk
 from boomdp_jax.inference.filtered_likelihood import without_gains
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.tracking import Gains
@@ -32,31 +31,32 @@ class Evaluation(NamedTuple):
     """Whitened innovations, `[point, reading]`."""
 
 
-class _Chunks(NamedTuple):
-    """What the points of each chunk share; leading axis `chunk`."""
+class _Known(NamedTuple):
+    """What the points of a chunk share; leading axis `owner`."""
 
     likelihood: Any
     """Without structures and gains, whose shapes depend on the number of structures."""
     gains: Gains
-    reference: Float[Array, "chunk body 4"]
-    active: Bool[Array, "chunk slot"]
+    reference: Float[Array, "owner body 4"]
+    active: Bool[Array, "owner slot"]
 
 
-def _gather(targets: StructureTarget, index, structure, z) -> tuple[_Chunks, Any]:
+def _gather(targets: StructureTarget, owners, owner, num, z) -> tuple:
     """What chunks need of the targets, which alone knows how many objects there are."""
     likelihood: Any = targets.log_likelihood
+    index, structure = owners[:, 0], owners[:, 1]
     gains = jax.tree.map(lambda leaf: leaf[index, structure], likelihood.gains)
     reference = likelihood.reference[index, structure]
     bare = jax.tree.map(lambda leaf: leaf[index], without_gains(likelihood))
     active = targets.structures[index, structure]
-    return _Chunks(bare, gains, reference, active), z
+    return _Known(bare, gains, reference, active), owner, num, z
 
 
-def _evaluate_chunks(chunks: _Chunks, z):
-    """Log-likelihoods of chunks `[chunk, point, dim]`."""
+def _evaluate_chunks(known: _Known, owner, num, z):
+    """Log-likelihoods of chunks `[chunk, place, dim]`."""
 
-    def one_chunk(both):
-        (likelihood, gains, reference, active), z = both
+    def one_chunk(known: _Known, z):
+        likelihood, gains, reference, active = known
         log_volume = likelihood.log_volume(gains)
 
         def one_point(z):
@@ -66,10 +66,7 @@ def _evaluate_chunks(chunks: _Chunks, z):
 
         return jax.vmap(one_point)(z)
 
-    # One after the other: with a batch axis of their own, what the points of a chunk
-    # share would have to be spread over all of them before every small loop. That takes
-    # twice as long, and the extended filter four times.
-    return jax.lax.map(one_chunk, (chunks, z))
+    return for_each_chunk(one_chunk, known, owner, num, z)
 
 
 _LIKELIHOODS = Program(_gather, _evaluate_chunks)
@@ -110,21 +107,24 @@ def evaluate_points(
         One row per point, in the order given.
     """
     chunks = Chunking.of(index, structure, targets.structures.shape[1])
-    dtype, number = targets.log_prior.dtype, np.int32
+    dtype = targets.log_prior.dtype
+    dealt = list(chunks.calls(num_at_a_time()))
     inputs = [
-        (objects.astype(number), structures.astype(number), z[rows].astype(dtype))
-        for (objects, structures), rows in chunks.calls()
+        (call.owners, call.owner, call.num, z[call.rows].astype(dtype))
+        for call in dealt
     ]
     calls = run_each(_LIKELIHOODS, targets, inputs)
 
     def gather(pick):
-        return chunks.in_order([pick(call) for call in calls])
+        return chunks.in_order(
+            [pick(found)[: call.num] for found, call in zip(calls, dealt, strict=True)]
+        )
 
-    log_likelihood = gather(lambda call: call[0]).astype(float)
+    log_likelihood = gather(lambda found: found[0]).astype(float)
     log_density = log_likelihood + log_prior_density(targets, index, structure, z)
     return Evaluation(
         log_density=np.where(log_likelihood > -1e29, log_density, -np.inf),
-        num=gather(lambda call: call[1].num),
-        square=gather(lambda call: call[1].square),
-        innovation=gather(lambda call: call[2]) if with_innovations else None,
+        num=gather(lambda found: found[1].num),
+        square=gather(lambda found: found[1].square),
+        innovation=gather(lambda found: found[2]) if with_innovations else None,
     )

@@ -11,7 +11,12 @@ import jax.numpy as jnp
 
 from boomdp_jax.core.arrays import FloatScalar
 from boomdp_jax.inference.contact_prediction import ContactScene
-from boomdp_jax.inference.filter_update import correct, move_and_correct
+from boomdp_jax.inference.filter_update import (
+    correct,
+    move_and_correct,
+    move_and_correct_channels,
+    start_and_correct_channels,
+)
 from boomdp_jax.inference.kalman import (
     NoiseLevel,
     channel_scale,
@@ -21,7 +26,14 @@ from boomdp_jax.inference.kalman import (
 )
 from boomdp_jax.inference.robust_update import correct_robustly, move
 from boomdp_jax.inference.track_data import TrackData, with_delay
-from boomdp_jax.inference.tracking import channel_difference, cloud_predictor
+from boomdp_jax.inference.tracking import (
+    channel_difference,
+    channel_differences,
+    cloud_predictor,
+    join_channels,
+    predictor,
+    split_channels,
+)
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 
@@ -44,6 +56,8 @@ def filter_density(
         The same as `extended_filter` gives. To be batched by `jax.vmap`.
     """
     data = with_delay(params, data)
+    if isinstance(scene, Scene) and data.freedom is None and scene.num_bodies == 1:
+        return _density_of_one_body(scene, params, data, noise)
     steps = data.steps
     predict = cloud_predictor(scene, params, steps.dt)
     num_bodies = steps.state.shape[1]
@@ -86,6 +100,61 @@ def filter_density(
         return (state, covariance, total + density), None
 
     carry = (jnp.zeros((num_bodies, 6)), jnp.eye(num), jnp.zeros(()))
+    return jax.lax.scan(advance, carry, data.rows)[0][2]
+
+
+def _density_of_one_body(
+    scene: Scene, params: Params, data: TrackData, noise: NoiseLevel
+) -> FloatScalar:
+    """The same channel by channel, each a vector in a batch of points."""
+    predict = predictor(scene, params, data.steps.dt)
+    scale = channel_scale(noise.reading).reshape(-1)
+    at_first = list((start_factor(data.freedom) * scale) ** 2)
+    unknown = list(start_scale(1) ** 2)
+    variance, kick = list(scale**2), list(kick_scale(noise.impulse).reshape(-1) ** 2)
+    offsets = jnp.concatenate([jnp.zeros((1, 6)), jnp.diag(scale)])
+    num = range(6)
+
+    def advance(carry, row):
+        state, lower, total = carry
+        seen = [row.first_mask[0, i] for i in num]
+        at_start = [jnp.where(seen[i] > 0, at_first[i], unknown[i]) for i in num]
+        state = [
+            jnp.where(row.is_start > 0, row.start[0, i], x) for i, x in enumerate(state)
+        ]
+        shift, lower, first_density = start_and_correct_channels(
+            row.is_start,
+            at_start,
+            lower,
+            channel_differences(row.first, state),
+            [row.is_second * mask for mask in seen],
+            variance,
+        )
+        state = [x + move for x, move in zip(state, shift, strict=True)]
+        points = [x + offsets[:, i] for i, x in enumerate(state)]
+        images = jax.vmap(
+            lambda *point: split_channels(
+                predict(join_channels(point), row.action, row.dt)
+            )
+        )(*points)
+        state = [image[0] for image in images]
+        shift, lower, last_density = move_and_correct_channels(
+            lower,
+            [[image[k + 1] - image[0] for image in images] for k in num],
+            list(scale),
+            kick,
+            channel_differences(row.last, state),
+            [row.last_mask[0, i] for i in num],
+            variance,
+        )
+        state = [x + move for x, move in zip(state, shift, strict=True)]
+        density = first_density + last_density
+        density = density if row.weight is None else row.weight * density
+        return (state, lower, total + density), None
+
+    zero, one = jnp.zeros(()), jnp.ones(())
+    lower = [[one if i == j else zero for j in range(i + 1)] for i in num]
+    carry = ([zero for _ in num], lower, zero)
     return jax.lax.scan(advance, carry, data.rows)[0][2]
 
 

@@ -5,8 +5,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from boomdp_jax.core.spread import Program, run_each
-from boomdp_jax.inference.chunking import Chunking
+from boomdp_jax.core.spread import Program, num_at_a_time, run_each
+from boomdp_jax.inference.chunking import Chunking, for_each_chunk
 from boomdp_jax.inference.filter_density import filter_density
 from boomdp_jax.inference.kalman import Filtered, NoiseLevel, extended_filter
 from boomdp_jax.inference.noise_level import NoiseFit
@@ -16,27 +16,29 @@ from boomdp_jax.inference.target import StructureTarget
 _POINTS_PER_CALL = 8
 
 
-def _gather_chunks(targets: StructureTarget, index, structure, z, noise) -> tuple:
+def _gather_chunks(targets: StructureTarget, owners, owner, num, points) -> tuple:
     likelihood: Any = targets.log_likelihood
+    index = owners[:, 0]
     known = likelihood.coordinates, likelihood.data
     known = jax.tree.map(lambda leaf: leaf[index], known)
-    return known, targets.structures[index[:, None], structure], z, noise
+    structure, z, noise = points
+    active = targets.structures[index[owner][:, None], structure]
+    return known, owner, num, (active, z, noise)
 
 
-def _densities_of_chunks(known, active, z, noise):
-    """Log-likelihoods of chunks `[chunk, point, ...]`."""
+def _densities_of_chunks(known, owner, num, points):
+    """Log-likelihoods of chunks `[chunk, place, ...]`."""
 
-    def one_chunk(chunk):
-        (coordinates, data), active, z, noise = chunk
+    def one_chunk(known, points):
+        coordinates, data = known
 
         def one_point(active, z, noise):
             params = coordinates(z, active)
             return filter_density(coordinates.world, params, data, NoiseLevel(*noise))
 
-        return jax.vmap(one_point)(active, z, noise)
+        return jax.vmap(one_point)(*points)
 
-    # One after the other, see `evaluate`.
-    return jax.lax.map(one_chunk, (known, active, z, noise))
+    return for_each_chunk(one_chunk, known, owner, num, points)
 
 
 _DENSITIES = Program(_gather_chunks, _densities_of_chunks)
@@ -62,19 +64,29 @@ def filter_densities(
         `[point]`, minus infinity where the filter's result is not finite.
     """
     # Nothing here belongs to a structure as gains do: chunks are of one object.
-    chunks = Chunking.of(index, np.zeros_like(structure), 1, size=32, per_call=2)
+    chunks = Chunking.of(index, np.zeros_like(structure), 1)
     dtype = targets.log_prior.dtype
+    dealt = list(chunks.calls(num_at_a_time()))
     inputs = [
         (
-            objects.astype(np.int32),
-            structure[rows].astype(np.int32),
-            z[rows].astype(dtype),
-            (noise.reading[rows].astype(dtype), noise.impulse[rows].astype(dtype)),
+            call.owners,
+            call.owner,
+            call.num,
+            (
+                structure[call.rows].astype(np.int32),
+                z[call.rows].astype(dtype),
+                (
+                    noise.reading[call.rows].astype(dtype),
+                    noise.impulse[call.rows].astype(dtype),
+                ),
+            ),
         )
-        for (objects, _), rows in chunks.calls()
+        for call in dealt
     ]
     calls = run_each(_DENSITIES, targets, inputs)
-    found = chunks.in_order(calls).astype(float)
+    found = chunks.in_order(
+        [values[: call.num] for values, call in zip(calls, dealt, strict=True)]
+    ).astype(float)
     return np.where(np.isfinite(found), found, -np.inf)
 
 

@@ -70,6 +70,30 @@ def move_and_correct(
     return _arrays(*one_loop(_move_and_correct, *_scalars(*arrays)))
 
 
+def start_and_correct_channels(is_start, at_start, lower, miss, mask, variance):
+    """As `correct`, of scalars; a track that starts here forgets what was before.
+
+    Args:
+        is_start: one where a track starts, else zero.
+        at_start: variance of each channel there.
+        lower: rows of the lower triangle of the covariance.
+        miss: of each channel.
+        mask: of each.
+        variance: of each.
+
+    Returns:
+        Shift of each channel, the new lower triangle, log-density.
+    """
+    arguments = (is_start, at_start, lower, miss, mask, variance)
+    return one_loop(_start_and_correct, *arguments)
+
+
+def move_and_correct_channels(lower, rise, scale, kick, miss, mask, variance):
+    """As `move_and_correct`, of scalars and lower triangles."""
+    arguments = (lower, rise, scale, kick, miss, mask, variance)
+    return one_loop(_move_and_correct_lower, *arguments)
+
+
 def _scalars(*arrays: Array) -> list:
     """Arrays as lists of scalars, matrices as lists of rows."""
     return [
@@ -97,6 +121,20 @@ def _move_and_correct(covariance, rise, scale, kick, miss, mask, variance):
     half = [[_dot(slope[i], spread[j]) for j in num] for i in num]
     moved = [[_dot(half[i], slope[j]) for j in range(i + 1)] for i in num]
     return _correct_lower(moved, miss, mask, variance)
+
+
+def _move_and_correct_lower(lower, *rest):
+    num = range(len(lower))
+    covariance = [[lower[max(i, j)][min(i, j)] for j in num] for i in num]
+    return _move_and_correct(covariance, *rest)
+
+
+def _start_and_correct(is_start, at_start, lower, miss, mask, variance):
+    kept = 1.0 - is_start
+    lower = [[kept * x for x in row] for row in lower]
+    for i, row in enumerate(lower):
+        row[i] = row[i] + is_start * at_start[i]
+    return _correct_lower(lower, miss, mask, variance)
 
 
 def _correct(covariance, miss, mask, variance):

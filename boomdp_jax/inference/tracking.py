@@ -13,7 +13,8 @@ least squares. With K = 1 for the reading that a step starts from and K = 0 for 
 that it ends at, this is the one-step likelihood of "What Does Physics Bias".
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -101,9 +102,20 @@ def channel_difference(
 ) -> Float[Array, "body 6"]:
     """Reading minus state, angles the shorter way round."""
     difference = reading - state
-    angle = difference[:, 2]
+    return difference.at[:, 2].set(_least_angle(difference[:, 2]))
+
+
+def channel_differences(reading: Float[Array, "1 6"], state: list) -> list:
+    """The same channel by channel, of one body."""
+    each = [reading[0, i] - x for i, x in enumerate(state)]
+    each[2] = _least_angle(each[2])
+    return each
+
+
+def _least_angle(angle):
+    """The same direction by less than half a turn [rad]."""
     turns = jax.lax.stop_gradient(jnp.round(angle / (2.0 * jnp.pi)))
-    return difference.at[:, 2].set(angle - 2.0 * jnp.pi * turns)
+    return angle - 2.0 * jnp.pi * turns
 
 
 Predict = Callable[
@@ -196,8 +208,19 @@ def innovations(
     def advance(state, inputs):
         return track_row(predict, state, *inputs)
 
-    start = jnp.zeros(data.steps.state.shape[1:])
-    return jax.lax.scan(advance, start, (data.rows, gains))[1]
+    shape = data.steps.state.shape[1:]
+    if math.prod(shape) > _MAX_WRITTEN_OUT:
+        return jax.lax.scan(advance, jnp.zeros(shape), (data.rows, gains))[1]
+
+    # Channel by channel from row to row: a batch of points is then a vector for each,
+    # and all arithmetic is on vectors. As one array of channels for each point the
+    # same takes twice as long.
+    def advance_channels(channels, inputs):
+        return _track_channels(predict, channels, *inputs)
+
+    start = list(jnp.zeros(math.prod(shape)))
+    _, whitened = jax.lax.scan(advance_channels, start, (data.rows, gains))
+    return jnp.stack(whitened, axis=-1).reshape(-1, 2, *shape)
 
 
 def track_row(
@@ -214,11 +237,15 @@ def track_row(
     Returns:
         The best guess after it, and the whitened innovations of its two readings.
     """
+    if state.size <= _MAX_WRITTEN_OUT:
+        channels, whitened = _track_channels(predict, split_channels(state), row, gains)
+        return join_channels(channels), jnp.stack(whitened).reshape(2, *state.shape)
 
     def correct(state, reading, mask, gain, whitening):
         error = mask * channel_difference(reading, state)
-        moved = state + _apply(gain, error)
-        return moved, _apply(whitening, error, is_lower=True)
+        flat = error.reshape(-1)
+        moved = state + (gain @ flat).reshape(state.shape)
+        return moved, (whitening @ flat).reshape(state.shape)
 
     state = jnp.where(row.is_start > 0, row.start, state)
     state, first_error = correct(
@@ -231,14 +258,39 @@ def track_row(
     return state, jnp.stack([first_error, last_error])
 
 
-def _apply(matrix, vector: Float[Array, "body 6"], *, is_lower: bool = False):
-    """Matrix times channels, written out where there are few."""
-    flat = vector.reshape(-1)
-    num = flat.shape[0]
-    if num > _MAX_WRITTEN_OUT:
-        return (matrix @ flat).reshape(vector.shape)
-    rows = []
-    for i in range(num):
-        terms = [matrix[i, j] * flat[j] for j in range(i + 1 if is_lower else num)]
-        rows.append(sum(terms[1:], terms[0]))
-    return jnp.stack(rows).reshape(vector.shape)
+def _track_channels(predict: Predict, state: list, row: TrackRow, gains: Gains):
+    """The same for the channels of one body, one by one, and as they come."""
+
+    def correct(state, reading, mask, gain, whitening):
+        difference = channel_differences(reading, state)
+        error = [mask[0, i] * x for i, x in enumerate(difference)]
+        moved = [x + _dot(gain[i], error) for i, x in enumerate(state)]
+        return moved, [_dot(whitening[i], error[: i + 1]) for i in range(len(error))]
+
+    state = [
+        jnp.where(row.is_start > 0, row.start[0, i], x) for i, x in enumerate(state)
+    ]
+    state, first_error = correct(
+        state, row.first, row.first_mask, gains.first, gains.first_whitening
+    )
+    state = split_channels(predict(join_channels(state), row.action, row.dt))
+    state, last_error = correct(
+        state, row.last, row.last_mask, gains.last, gains.last_whitening
+    )
+    return state, first_error + last_error
+
+
+def split_channels(state: Float[Array, "1 6"]) -> list:
+    """One by one: by slices, which take nothing where channels were just joined."""
+    each = [jax.lax.slice_in_dim(state, i, i + 1, axis=1) for i in range(6)]
+    return [x.reshape(()) for x in each]
+
+
+def join_channels(channels: Sequence) -> Float[Array, "1 6"]:
+    """Back to channels of one body."""
+    return jnp.concatenate([x.reshape(1, 1) for x in channels], axis=1)
+
+
+def _dot(row, vector: list):
+    terms = [row[i] * x for i, x in enumerate(vector)]
+    return sum(terms[1:], terms[0])

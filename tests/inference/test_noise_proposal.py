@@ -1,10 +1,17 @@
 """Proposals of noise against SciPy's t, and chunks of points against a plain loop."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.stats import kstest, multivariate_t
 
-from boomdp_jax.inference.chunking import Chunking
+from boomdp_jax.inference.chunking import (
+    MAX_CHUNKS,
+    MAX_OWNERS,
+    Chunking,
+    for_each_chunk,
+)
 from boomdp_jax.inference.fit_noise import NoisePeaks
 from boomdp_jax.inference.noise_level import NoiseFit
 from boomdp_jax.inference.noise_proposal import NoiseProposal
@@ -53,23 +60,43 @@ def test_draws_follow_their_group(proposal):
             assert kstest(own @ direction, theirs @ direction).pvalue > 1e-4
 
 
-@pytest.mark.parametrize("num_points", [0, 1, 31, 500])
-def test_every_point_gets_its_own_result(num_points):
+@pytest.mark.parametrize("num_workers", [1, 2, 7])
+@pytest.mark.parametrize("num_points", [0, 1, 31, 500, 3000])
+def test_every_point_gets_its_own_result(num_points, num_workers):
     rng = np.random.default_rng(num_points)
     index = rng.integers(0, 3, num_points)
-    structure = rng.integers(0, 4, num_points)
+    structure = rng.integers(0, 7, num_points)
     value = rng.normal(size=num_points)
-    chunks = Chunking.of(index, structure, 4)
-    found = []
-    for (objects, structures), rows in chunks.calls():
-        if num_points:
-            assert np.all(index[rows] == objects[:, None])
-            assert np.all(structure[rows] == structures[:, None])
-            found.append(value[rows])
+    chunks = Chunking.of(index, structure, 7)
+    found, sizes = [], []
+    for call in chunks.calls(num_workers):
+        sizes.append(call.num)
+        owners, rows = call.owners[call.owner[: call.num]], call.rows[: call.num]
+        assert call.owners.shape == (MAX_OWNERS, 2)
+        assert call.owner.shape == (MAX_CHUNKS,)
+        assert len(call.rows) == MAX_CHUNKS
+        assert np.all(index[rows] == owners[:, :1])
+        assert np.all(structure[rows] == owners[:, 1:])
+        found.append(value[rows])
     if num_points:
         np.testing.assert_array_equal(chunks.in_order(found), value)
+        most = -(-len(chunks.owner) // num_workers)
+        assert max(int(n) for n in sizes) <= max(most, 1)
     else:
         assert not found
+
+
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+def test_chunks_that_count_are_worked_on_by_what_they_belong_to(backend, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    owner, num = jnp.array([0, 0, 1, 0], jnp.int32), jnp.int32(3)
+    points = jnp.arange(8.0).reshape(4, 2)
+    found = jax.jit(
+        lambda known: for_each_chunk(lambda k, x: (k * x, x), known, owner, num, points)
+    )(jnp.array([10.0, 100.0]))
+    expected = np.array([10.0, 10.0, 100.0])[:, None] * points[:3]
+    np.testing.assert_array_equal(np.asarray(found[0])[:3], expected)
+    np.testing.assert_array_equal(np.asarray(found[1])[:3], points[:3])
 
 
 def test_peaks_that_are_the_same_are_covered_once():
