@@ -12,12 +12,11 @@ forgotten, a structure's prior off by a constant, and a likelihood counted twice
 from collections.abc import Callable
 from typing import NamedTuple
 
+import _repository  # noqa: F401
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _prior_objects import PriorObjects, draw_objects
-from _ranks import rank, thin, uniformity
 from _report import Reporter, parser_of
 
 from boomdp_jax.inference.evaluate import evaluate_points, log_prior_density
@@ -29,6 +28,8 @@ from boomdp_jax.inference.sample import SAMPLERS
 from boomdp_jax.inference.structure_draws import SampleSettings, start_mixtures
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.weighing import batch_noise, evaluate_each
+from tests.inference.prior_objects import PriorObjects, draw_objects
+from tests.reference.ranks import rank, thin, uniformity
 
 METHODS = ("rj", "enumerate", "smc")
 FALSE_ALARM = 0.01

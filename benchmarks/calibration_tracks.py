@@ -12,10 +12,9 @@ answer.)
 
 from typing import NamedTuple
 
+import _repository  # noqa: F401
 import jax
 import numpy as np
-from _prior_objects import PriorTracks, draw_tracks
-from _ranks import rank, thin, uniformity
 from _report import Reporter, parser_of
 
 from boomdp_jax.inference.evaluate import log_prior_density
@@ -23,6 +22,8 @@ from boomdp_jax.inference.filter_points import filter_densities
 from boomdp_jax.inference.noise_level import NoiseFit, prior_noise
 from boomdp_jax.inference.sample import sample_blocks
 from boomdp_jax.inference.structure_draws import SampleSettings
+from tests.inference.prior_objects import PriorTracks, draw_tracks
+from tests.reference.ranks import rank, thin, uniformity
 
 METHODS = ("rj", "enumerate", "smc")
 FALSE_ALARM = 0.01

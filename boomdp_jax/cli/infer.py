@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import sys
+from typing import Any
 
 from boomdp_jax.cli.output import (
     check_figure,
@@ -89,7 +90,7 @@ def _sweep(arguments: argparse.Namespace, spec) -> None:
         arguments.out,
         batch=batch,
         num_rows=arguments.rows,
-        method=arguments.method,
+        **_options(arguments),
     )
     units = sweep.units(shard)
     if not arguments.resume:
@@ -132,8 +133,17 @@ def _infer(arguments: argparse.Namespace, spec, histories: list) -> list:
         from boomdp_jax.inference.infer import infer, infer_batch
 
         key = jax.random.key(arguments.seed)
-        method = arguments.method
+        options = _options(arguments)
         if len(histories) == 1:
-            return [infer(key, spec, histories[0], method=method, progress=True)]
+            return [infer(key, spec, histories[0], progress=True, **options)]
         specs = [spec] * len(histories)
-        return list(infer_batch(key, specs, histories, method=method, progress=True))
+        return list(infer_batch(key, specs, histories, progress=True, **options))
+
+
+def _options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """How to infer, as the library's functions take it."""
+    return {
+        "method": arguments.method,
+        "likelihood": arguments.likelihood,
+        "horizon": arguments.horizon,
+    }

@@ -11,6 +11,9 @@ from typing import NoReturn, TextIO
 METHODS = ("auto", "rj", "enumerate", "smc", "nuts", "svi", "laplace", "map")
 """Ways to infer that exist."""
 
+LIKELIHOODS = ("auto", "filtered", "one-step", "open-loop")
+"""Likelihoods of readings that exist."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
@@ -67,6 +70,20 @@ def _add_infer(parser: argparse.ArgumentParser) -> None:
     add("--scene", required=True, metavar="SCENE.json", help="planar-scene-1")
     add("--rows", type=_whole(1), metavar="N", help="use the first N rows")
     add("--method", choices=METHODS, default="auto")
+    add(
+        "--likelihood",
+        choices=LIKELIHOODS,
+        default="auto",
+        help="filtered: all readings are noisy; one-step: those that a step starts from"
+        " are exact; open-loop: so are those that a long prediction starts from, which"
+        " makes intervals too narrow; default: filtered, of nuts and svi one-step",
+    )
+    add(
+        "--horizon",
+        type=_whole(1),
+        metavar="K",
+        help="of open-loop: most steps of a prediction; default: no limit",
+    )
     add("--seed", type=_whole(0, 2**32 - 1), default=0)
     add(
         "--out",

@@ -18,6 +18,7 @@ from boomdp_jax.inference.kinds_file import LearntKinds as LearntKinds
 from boomdp_jax.inference.kinds_file import load_kinds as load_kinds
 from boomdp_jax.inference.kinds_posterior import KindsPosterior as KindsPosterior
 from boomdp_jax.inference.laplace_mixture import LaplaceMixture as LaplaceMixture
+from boomdp_jax.inference.likelihoods import LIKELIHOODS as LIKELIHOODS
 from boomdp_jax.inference.numpyro_model import ObjectModel as ObjectModel
 from boomdp_jax.inference.numpyro_model import make_model as make_model
 from boomdp_jax.inference.nuts import run_nuts as run_nuts
@@ -36,6 +37,7 @@ from boomdp_jax.inference.sweep import infer_sweep as infer_sweep
 from boomdp_jax.inference.target import StructureTarget as StructureTarget
 
 __all__ = [
+    "LIKELIHOODS",
     "METHODS",
     "BeliefState",
     "Identifiability",

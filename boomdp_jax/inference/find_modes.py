@@ -12,6 +12,7 @@ import numpy as np
 
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.inference.evaluate import evaluate_points
+from boomdp_jax.inference.exact_starts import ExactStarts, with_open_loop
 from boomdp_jax.inference.fit import (
     Fits,
     FitSettings,
@@ -108,6 +109,43 @@ def find_single_step_modes(
     rng = host_generator(key)
     fits = _single_step_fits(rng, targets, Guesses.of(targets), settings)
     return collect_modes(targets, fits, settings.num_modes)
+
+
+def find_modes_of_exact_starts(
+    key: Key,
+    targets: StructureTarget,
+    starts: ExactStarts,
+    settings: FitSettings,
+    report: Callable[[str], None] = lambda stage: None,
+) -> tuple[StructureTarget, Modes]:
+    """Fit every structure by predictions that start from readings as if exact.
+
+    Long predictions have many local optima: they are climbed from where single steps
+    have led.
+
+    Args:
+        key: source of starts.
+        targets: as for `find_modes`.
+        starts: where predictions start.
+        settings: how hard to look.
+        report: called with the name of each stage as it begins.
+
+    Returns:
+        Targets with the gains of such predictions, and up to `num_modes` modes per
+        structure and object.
+    """
+    rng = host_generator(key)
+    guesses = Guesses.of(targets)
+    report("fitting single steps")
+    fits = _single_step_fits(rng, targets, guesses, settings)
+    if starts.horizon != 1:
+        report("fitting open loops")
+        targets = with_open_loop(targets, starts)
+        again = make_fits(targets, fits.index, fits.structure, fits.z)
+        fits = climb(targets, again, settings.num_iterations)
+        grown = grown_fits(rng, targets, guesses, fits, settings)
+        fits = join_fits(fits, climb(targets, grown, settings.num_iterations))
+    return targets, collect_modes(targets, fits, settings.num_modes)
 
 
 def _single_step_fits(

@@ -11,7 +11,9 @@ from boomdp_jax.inference.one_step import NOISE_SHAPE
 from boomdp_jax.inference.target import StructureTarget
 
 
-def draw_noise_scales(key: Key, targets: StructureTarget, structure, z) -> np.ndarray:
+def draw_noise_scales(
+    key: Key, targets: StructureTarget, structure, z, *, is_drawn: bool = True
+) -> np.ndarray:
     """Noise scales given every draw, from their inverse-gamma distribution.
 
     Args:
@@ -19,6 +21,7 @@ def draw_noise_scales(key: Key, targets: StructureTarget, structure, z) -> np.nd
         targets: with a `FilteredLikelihood`, stacked along a leading object axis.
         structure: of each draw, `[object, draw]`.
         z: coordinates of each draw, `[object, draw, dim]`.
+        is_drawn: whether noise is drawn, or the most probable one by its logarithm.
 
     Returns:
         Sd of position [m], angle [rad], velocity [m/s] and spin [rad/s], `[object,
@@ -34,6 +37,6 @@ def draw_noise_scales(key: Key, targets: StructureTarget, structure, z) -> np.nd
     scale = np.asarray(likelihood.coordinates.scales.noise, float)[index, None]
     shape = NOISE_SHAPE + 0.5 * found.num
     rate = (scale / reference) ** 2 + 0.5 * found.square
-    draws = host_generator(key).gamma(shape)
+    draws = host_generator(key).gamma(shape) if is_drawn else shape
     sd = reference * np.sqrt(rate / draws)
     return sd.astype(z.dtype).reshape(num_objects, num_draws, *sd.shape[1:])

@@ -12,13 +12,19 @@ from boomdp_jax.core.spread import is_spread
 from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics, diagnose_chains
 from boomdp_jax.inference.compile_ahead import CompileAhead, signature
 from boomdp_jax.inference.enumerate_structures import enumerate_structures
+from boomdp_jax.inference.exact_starts import ExactStarts
 from boomdp_jax.inference.filter_points import filter_densities, filter_points
-from boomdp_jax.inference.find_modes import Found, find_modes
+from boomdp_jax.inference.find_modes import (
+    Found,
+    find_modes,
+    find_modes_of_exact_starts,
+)
 from boomdp_jax.inference.fit import Modes
 from boomdp_jax.inference.laplace_draws import best_hypothesis, sample_laplace
 from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.noise_correction import infer_noise, noise_about_peaks
 from boomdp_jax.inference.noise_level import NoiseFit
+from boomdp_jax.inference.noise_scales import draw_noise_scales
 from boomdp_jax.inference.population import Population, sample_population
 from boomdp_jax.inference.structure_chain import ChainDraws
 from boomdp_jax.inference.structure_draws import (
@@ -75,6 +81,7 @@ def sample_blocks(
     report: Callable[[str], None] = lambda stage: None,
     *,
     method: str = "rj",
+    starts: ExactStarts | None = None,
 ) -> BlockDraws:
     """Posterior draws over structures and coordinates of a batch of equal blocks.
 
@@ -84,17 +91,29 @@ def sample_blocks(
         settings: how much to draw.
         report: called with the name of each stage as it begins.
         method: one of `SAMPLERS`.
+        starts: where predictions start, from readings that are taken as exact; None:
+            states are latent, and noise of the motion is inferred as well.
 
     Returns:
         Draws of all chains one after the other, noise drawn given each.
     """
     fit_key, draw_key, noise_key = jax.random.split(key, 3)
     draw = SAMPLERS[method]
-    with_filters = not is_spread()
+    with_filters = starts is None and not is_spread()
     ahead = CompileAhead(
         lambda: _rehearse(draw_key, targets, settings, draw, with_filters),
         (signature(targets), settings, method, with_filters),
     )
+    if starts is not None:
+        with ahead:
+            targets, modes = find_modes_of_exact_starts(
+                fit_key, targets, starts, settings.fit, report
+            )
+        report(_STAGES[method])
+        drawn = draw(draw_key, targets, modes, settings, evaluate_each)
+        return _with_integrated_noise(
+            noise_key, targets, drawn, is_drawn=method != "map"
+        )
     with ahead:
         found: Found = find_modes(fit_key, targets, settings.fit, report)
     targets = found.targets
@@ -160,6 +179,25 @@ def _with_noise_about_peaks(
         log_density=log_density,
         noise_scale=own.reading.reshape(*structure.shape, -1, 4),
         impulse_scale=own.impulse.reshape(*structure.shape, -1, 2),
+        log_evidence=drawn.evidence.total,
+        evidence=drawn.evidence,
+        diagnostics=drawn.diagnostics,
+        chain_index=np.arange(drawn.structure.shape[1]),
+    )
+
+
+def _with_integrated_noise(
+    key: Key, targets: StructureTarget, drawn: StructureDraws, *, is_drawn: bool
+) -> BlockDraws:
+    """Draws of a likelihood that noise was integrated out of, with noise given each."""
+    structure = drawn.structure.reshape(len(drawn.structure), -1)
+    z = drawn.z.reshape(*structure.shape, -1)
+    return BlockDraws(
+        structure=structure,
+        z=z,
+        log_density=drawn.log_density.reshape(structure.shape),
+        noise_scale=draw_noise_scales(key, targets, structure, z, is_drawn=is_drawn),
+        impulse_scale=None,
         log_evidence=drawn.evidence.total,
         evidence=drawn.evidence,
         diagnostics=drawn.diagnostics,

@@ -27,6 +27,7 @@ from boomdp_jax.core.history_file import load_history
 from boomdp_jax.core.json_file import check_same, read_json, write_json
 from boomdp_jax.inference.fixed_structure import Structure
 from boomdp_jax.inference.infer import METHODS, infer_batch, seed_of
+from boomdp_jax.inference.likelihoods import choose_likelihood
 from boomdp_jax.inference.posterior import library_versions
 from boomdp_jax.physics.scene_spec import SceneSpec
 
@@ -67,8 +68,8 @@ def infer_sweep(
         resume: whether units of this shard may be there already.
         num_rows: how many rows of each file to use, from the first; default: all.
         progress: show stages on standard error.
-        **options: `method`, `structure`, `num_chains`, `num_warmup` and `num_samples`,
-            as `infer_batch` takes them.
+        **options: `method`, `structure`, `likelihood`, `horizon`, `num_chains`,
+            `num_warmup` and `num_samples`, as `infer_batch` takes them.
 
     Returns:
         The files of this shard's objects, in order.
@@ -99,6 +100,8 @@ def begin_sweep(
     num_rows: int | None = None,
     method: str = "auto",
     structure: Structure | None = None,
+    likelihood: str = "auto",
+    horizon: int | None = None,
     num_chains: int = 4,
     num_warmup: int = 200,
     num_samples: int = 500,
@@ -114,6 +117,8 @@ def begin_sweep(
         num_rows: how many rows of each file to use.
         method: as in `infer_batch`.
         structure: as in `infer_batch`.
+        likelihood: as in `infer_batch`.
+        horizon: as in `infer_batch`.
         num_chains: as in `infer_batch`.
         num_warmup: as in `infer_batch`.
         num_samples: as in `infer_batch`.
@@ -130,6 +135,7 @@ def begin_sweep(
         raise ValueError(
             f"method: expected one of {', '.join(METHODS)}; got {method!r}"
         )
+    choose_likelihood(likelihood, horizon, method=method, outliers="none")
     if batch < 1:
         raise ValueError(f"batch: expected at least 1, got {batch}")
     if not histories:
@@ -143,6 +149,8 @@ def begin_sweep(
     options = {
         "method": method,
         "structure": None if structure is None else dict(structure),
+        "likelihood": likelihood,
+        "horizon": horizon,
         "num_chains": num_chains,
         "num_warmup": num_warmup,
         "num_samples": num_samples,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import boomdp_jax.inference
-from boomdp_jax.cli.main import METHODS, main
+from boomdp_jax.cli.main import LIKELIHOODS, METHODS, main
 from boomdp_jax.cli.output import numbered, without_non_finite
 
 SCENE = """{"schema": "planar-scene-1", "gravity": [0, 0], "dt": 0.02,
@@ -45,6 +45,23 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("infer data.npz", "required: --scene"),
         ("infer --scene scene.json", "required: DATA.npz"),
         ("infer data.npz --scene scene.json --method mcmc", "auto"),
+        ("infer data.npz --scene scene.json --likelihood kalman", "open-loop"),
+        (
+            "infer data.npz --scene scene.json --horizon 0",
+            "--horizon: expected",
+        ),
+        (
+            "infer data.npz --scene scene.json --horizon 5",
+            "horizon: expected none with likelihood 'filtered'",
+        ),
+        (
+            "infer data.npz --scene scene.json --likelihood one-step --horizon 5",
+            "horizon: expected none with likelihood 'one-step'",
+        ),
+        (
+            "infer data.npz --scene scene.json --method nuts --likelihood open-loop",
+            "likelihood: expected auto or one-step with method 'nuts', got 'open-loop'",
+        ),
         ("infer data.npz --scene scene.json --rows 0", "--rows: expected a whole"),
         ("infer data.npz --scene scene.json --rows 1.5", "--rows: expected a whole"),
         ("infer data.npz --scene scene.json --seed -1", "--seed: expected a whole"),
@@ -84,7 +101,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ),
         ("infer data.npz --scene scene.json --out no/out/", "no/out: No such file"),
         ("predict post.npz", "required: DATA.npz"),
-        ("predict post.npz data.npz --horizon 0", "--horizon: expected a whole"),
+        ("predict post.npz data.npz --horizon 0", "--horizon: expected"),
         ("simulate scene.json --out o.npz", "required: --actions"),
         (
             "simulate scene.json --actions actions.npz --out o.npz",
@@ -133,6 +150,7 @@ def test_an_unknown_method_names_those_that_exist(
 
 def test_methods_are_those_of_the_library():
     assert METHODS == boomdp_jax.inference.METHODS
+    assert LIKELIHOODS == boomdp_jax.inference.LIKELIHOODS
 
 
 def test_help_is_status_0(capsys: pytest.CaptureFixture):

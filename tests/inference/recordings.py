@@ -12,7 +12,12 @@ INERTIA = MASS * (SIZE[0] ** 2 + SIZE[1] ** 2) / 3.0
 NOISE = np.array([1e-3, 1e-3, 1e-3, 5e-3, 5e-3, 5e-3])
 
 
-def box_scene(unknown: dict[str, int] | None = None, **body) -> SceneSpec:
+def box_scene(
+    unknown: dict[str, int] | None = None,
+    *,
+    constraints: list[dict] | None = None,
+    **body,
+) -> SceneSpec:
     """A box seen from above whose density is unknown."""
     return scene_spec_from_dict(
         {
@@ -22,6 +27,7 @@ def box_scene(unknown: dict[str, int] | None = None, **body) -> SceneSpec:
             "bodies": [
                 {"name": "box", "shape": {"type": "box", "half_extents": SIZE}, **body}
             ],
+            "constraints": constraints or [],
             "unknown": unknown or {},
         },
         source="test",

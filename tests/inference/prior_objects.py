@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from boomdp_jax.core.history import make_history
+from boomdp_jax.core.history import History, make_history
 from boomdp_jax.inference.block import make_block, stack_blocks
 from boomdp_jax.inference.noise_level import NoiseFit, prior_noise
 from boomdp_jax.inference.target import StructureTarget
@@ -29,6 +29,10 @@ class PriorObjects(NamedTuple):
     """`[object]`."""
     z: np.ndarray
     """`[object, dim]`."""
+    noise_scale: np.ndarray
+    """Sd of what steps end at, of position, angle, velocity and spin, `[object, 4]`."""
+    histories: list[History]
+    """The readings."""
 
 
 def box_scene() -> SceneSpec:
@@ -64,15 +68,17 @@ def draw_objects(
     wrench = rng.normal(size=(num_objects, num_rows, 1, 3)) * _WRENCH * mass
     episode = np.arange(num_rows)
 
-    def stacked(next_state: np.ndarray) -> StructureTarget:
-        blocks = [
-            make_block(spec, (0,), make_history(s, a, n, DT, episode=episode))
+    def histories_of(next_state: np.ndarray) -> list[History]:
+        return [
+            make_history(s, a, n, DT, episode=episode)
             for s, a, n in zip(state, wrench, next_state, strict=True)
         ]
-        return stack_blocks(blocks)
+
+    def stacked(histories: list[History]) -> StructureTarget:
+        return stack_blocks([make_block(spec, (0,), each) for each in histories])
 
     # Of targets only what does not depend on readings is used here.
-    targets = stacked(state)
+    targets = stacked(histories_of(state))
     probability = np.exp(np.asarray(targets.log_prior[0], float))
     structure = rng.choice(
         len(probability), size=num_objects, p=probability / probability.sum()
@@ -87,9 +93,10 @@ def draw_objects(
     likelihood: Any = targets.log_likelihood
     scale = np.asarray(likelihood.coordinates.scales.noise, float)[0]
     variance = scale**2 / rng.gamma(1.0, size=(num_objects, 4))
-    sd = np.sqrt(variance)[:, None, None, [0, 0, 1, 2, 2, 3]]
-    noise = sd * rng.standard_normal(truth.shape)
-    return PriorObjects(stacked(truth + noise), structure, z)
+    noise_scale = np.sqrt(variance)
+    sd = noise_scale[:, None, None, [0, 0, 1, 2, 2, 3]]
+    histories = histories_of(truth + sd * rng.standard_normal(truth.shape))
+    return PriorObjects(stacked(histories), structure, z, noise_scale, histories)
 
 
 class PriorTracks(NamedTuple):
