@@ -9,15 +9,20 @@ the physics is compiled once.
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.core.spread import Program, run_each
 from boomdp_jax.inference.chunking import Chunking
 from boomdp_jax.inference.filtered_likelihood import without_gains
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.tracking import Gains
+
+# Points of a chunk and chunks of a call.
+_POINTS_PER_CHUNK, _CHUNKS_PER_CALL = 16, 4
 
 
 class Evaluation(NamedTuple):
@@ -72,7 +77,24 @@ def _evaluate_chunks(chunks: _Chunks, z):
     return jax.lax.map(one_chunk, (chunks, z))
 
 
-_LIKELIHOODS = Program(_gather, _evaluate_chunks)
+_EVALUATE = QuickCompile(_evaluate_chunks)
+_LIKELIHOODS = Program(_gather, _EVALUATE)
+
+
+def _gather_pushed(targets: StructureTarget, index, structure, gains, action, z):
+    """The same with gains and wrenches of each chunk's own."""
+    chunks, z = _gather(targets, index, structure, z)
+    likelihood = eqx.tree_at(
+        lambda x: (x.data.steps.action, x.data.steps.commands),
+        chunks.likelihood,
+        (action, None),
+        is_leaf=lambda leaf: leaf is None,
+    )
+    return chunks._replace(likelihood=likelihood, gains=gains), z
+
+
+# Where commands take effect at once, what is compiled for points serves here, too.
+_PUSHED = Program(_gather_pushed, _EVALUATE)
 
 
 def log_prior_density(
@@ -109,7 +131,13 @@ def evaluate_points(
     Returns:
         One row per point, in the order given.
     """
-    chunks = Chunking.of(index, structure, targets.structures.shape[1])
+    chunks = Chunking.of(
+        index,
+        structure,
+        targets.structures.shape[1],
+        size=_POINTS_PER_CHUNK,
+        per_call=_CHUNKS_PER_CALL,
+    )
     dtype, number = targets.log_prior.dtype, np.int32
     inputs = [
         (objects.astype(number), structures.astype(number), z[rows].astype(dtype))
@@ -128,3 +156,48 @@ def evaluate_points(
         square=gather(lambda call: call[1].square),
         innovation=gather(lambda call: call[2]) if with_innovations else None,
     )
+
+
+def pushed_innovations(
+    targets: StructureTarget,
+    index: np.ndarray,
+    structure: np.ndarray,
+    gains: Gains,
+    action: np.ndarray,
+    z: np.ndarray,
+) -> np.ndarray:
+    """Innovations of lists of points under other gains and wrenches than the targets'.
+
+    Args:
+        targets: with a `FilteredLikelihood`, stacked along a leading object axis.
+        index: object of each list.
+        structure: of each list.
+        gains: of each list, leading axis `list`, on the host.
+        action: wrenches in effect in each list, `[list, time, body, 3]` [N, N, N m].
+        z: coordinates of up to 16 points of each list, `[list, point, dim]`.
+
+    Returns:
+        Whitened innovations `[list, point, time, 2, body, 6]`.
+    """
+    num_lists, num_points, _ = z.shape
+    chunks = -(-num_lists // _CHUNKS_PER_CALL) * _CHUNKS_PER_CALL
+    lists = np.minimum(np.arange(chunks), num_lists - 1)
+    # Shapes of the calls are those of `evaluate_points`.
+    points = np.minimum(np.arange(_POINTS_PER_CHUNK), num_points - 1)
+    dtype, number = targets.log_prior.dtype, np.int32
+    inputs = []
+    for begin in range(0, chunks, _CHUNKS_PER_CALL):
+        rows = lists[begin : begin + _CHUNKS_PER_CALL]
+        inputs.append(
+            (
+                index[rows].astype(number),
+                structure[rows].astype(number),
+                jax.tree.map(lambda leaf, rows=rows: leaf[rows].astype(dtype), gains),
+                action[rows].astype(dtype),
+                z[rows][:, points].astype(dtype),
+            )
+        )
+    calls = run_each(_PUSHED, targets, inputs)
+    found = np.concatenate([call[2] for call in calls])[:num_lists, :num_points]
+    shape = action.shape[1:3]
+    return found.reshape(num_lists, num_points, shape[0], 2, shape[1], 6).astype(float)
