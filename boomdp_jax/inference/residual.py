@@ -51,6 +51,8 @@ _MOVES = (1e-3, 3e-2)
 # Least noise of the motion that the first push is measured by, as a share of readings'.
 _LEAST_NOISE = 0.01
 _POINTS = 16
+# Mean square of standardised innovations from which their whiteness is judged.
+_LEAST_SQUARE = 0.5
 
 
 class BodyLaw(NamedTuple):
@@ -68,7 +70,7 @@ class ResidualCheck(NamedTuple):
     num_rows: int
     """Steps with readings."""
     laws: list[BodyLaw]
-    """Best first; none where there were too few readings, or where the filter failed."""
+    """Best first; none where readings were too few, or where the filter failed."""
     whiteness: list[dict[str, float]]
     """Of each body, p-value by channel group."""
 
@@ -300,9 +302,11 @@ class _Block:
             each = {}
             for name, group in zip(CHANNELS, _GROUPS, strict=True):
                 channels = list(group)
-                value = whiteness(
-                    base[:, 1, body, channels], counts[:, 1, body, channels], track
-                )
+                error = base[:, 1, body, channels]
+                seen = counts[:, 1, body, channels]
+                # Readings that are better than they are taken to be need not be white.
+                is_full = np.sum(error**2) > _LEAST_SQUARE * np.sum(seen)
+                value = whiteness(error, seen, track) if is_full else None
                 if value is not None:
                     each[name] = value
             found.append(each)

@@ -25,7 +25,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 # A law of which less than this share of its length is left is one of the model's own.
 _LEAST_LEFT = 1e-3
@@ -148,7 +148,7 @@ def _jackknife(
 def whiteness(
     innovation: Float[np.ndarray, "time channel"],
     counts: Float[np.ndarray, "time channel"],
-    track: Float[np.ndarray, " time"],
+    track: Int[np.ndarray, " time"],
 ) -> float | None:
     """Probability of innovations as correlated as these if they are white.
 
