@@ -240,12 +240,16 @@ class _Block:
         middle = 0.5 * (before + after)
         variance = np.diagonal(self._filtered.after.covariance, axis1=1, axis2=2)
         spread = np.sqrt(np.asarray(variance, float)).reshape(shape)
+        change = np.diff(self._wrench, axis=0, prepend=self._wrench[:1])
+        change = change / self._dt[:, None, None]
+        change[np.asarray(self._data.is_start) > 0] = 0.0
         paths = []
         for body in range(middle.shape[1]):
             own = spread[:, body]
             both = np.column_stack([np.hypot(own[:, 3], own[:, 4]), own[:, 5]])
             place = middle[:, body]
-            paths.append(Path(place[:, :3], place[:, 3:], self._wrench[:, body], both))
+            applied = (self._wrench[:, body], change[:, body])
+            paths.append(Path(place[:, :3], place[:, 3:], *applied, both))
         return paths
 
     def _by_moves(self, base: np.ndarray, scale: np.ndarray) -> np.ndarray:

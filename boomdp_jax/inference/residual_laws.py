@@ -18,6 +18,8 @@ class Path(NamedTuple):
     twist: Float[np.ndarray, "time 3"]
     wrench: Float[np.ndarray, "time 3"]
     """As the model has it act, world frame [N, N, N m]."""
+    change: Float[np.ndarray, "time 3"]
+    """Of the wrench from step to step, per second; none where a run begins."""
     spread: Float[np.ndarray, "time 2"]
     """How well velocity [m/s] and spin [rad/s] are known."""
 
@@ -146,6 +148,12 @@ LAWS: tuple[Law, ...] = (
         "a further share of the applied torque",
         "",
         lambda p: [_torque(p.wrench[:, 2])],
+    ),
+    Law(
+        "delay",
+        "the applied wrench as it was before, by",
+        "s",
+        lambda p: [-p.change],
     ),
     Law(
         "lever",

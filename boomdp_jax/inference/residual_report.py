@@ -12,6 +12,11 @@ FALSE_ALARMS = 0.01
 """Rate of scenes with no law missing of which one is said to miss, at most; the same
 for innovations that are said to be correlated."""
 
+# Nats that are asked for beyond that. Filters are linearised, and dry friction has kinks:
+# of 105 recordings of seven families of objects in our own engine (noise of 0 to 15 %,
+# pin, wheel and friction unknown) one cart with a dry wheel reached 8.6 where the
+# posterior was right. Above 10 were two such carts that the fit had wrong.
+_MARGIN = 3.0
 # Laws of each block that are listed.
 _MOST_LAWS = 3
 _NUM_GROUPS = 4
@@ -24,7 +29,7 @@ def report_residuals(
 
     A Bayes factor has a mean of one where the law is not there, so that it exceeds K /
     a with a probability under a / K (Markov's inequality): with K laws of all bodies
-    together, what exceeds that is a doubt. Correlated innovations without such a law
+    together, what exceeds that by a margin is a doubt. Correlated innovations without such a law
     are a note: readings of real sensors are often not white.
 
     Args:
@@ -38,7 +43,7 @@ def report_residuals(
     """
     checked = [result for result in results if result.residual is not None]
     num_bodies = sum(len(result.block.bodies) for result in checked)
-    threshold = math.log(max(num_bodies, 1) * len(LAWS) / FALSE_ALARMS)
+    threshold = math.log(max(num_bodies, 1) * len(LAWS) / FALSE_ALARMS) + _MARGIN
     least = FALSE_ALARMS / max(num_bodies * _NUM_GROUPS, 1)
     entries, reasons, notes = [], [], []
     for result in checked:

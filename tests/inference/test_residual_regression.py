@@ -143,7 +143,7 @@ def test_correlated_innovations_do_not_pass_and_few_are_not_judged():
 
 def random_path(rng) -> Path:
     shape = (30, 3)
-    return Path(*rng.normal(size=(3, *shape)), np.full((30, 2), 1e-3))
+    return Path(*rng.normal(size=(4, *shape)), np.full((30, 2), 1e-3))
 
 
 def test_laws_of_the_bodys_own_frame_turn_with_the_world():
@@ -156,6 +156,7 @@ def test_laws_of_the_bodys_own_frame_turn_with_the_world():
         path.pose @ turn.T + np.array([0.0, 0.0, angle]),
         path.twist @ turn.T,
         path.wrench @ turn.T,
+        path.change @ turn.T,
         path.spread,
     )
     for law in LAWS:
