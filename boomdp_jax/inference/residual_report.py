@@ -12,8 +12,8 @@ FALSE_ALARMS = 0.01
 """Rate of scenes with no law missing of which one is said to miss, at most; the same
 for innovations that are said to be correlated."""
 
-# Nats that are asked for beyond that. Filters are linearised, and dry friction has kinks:
-# of 105 recordings of seven families of objects in our own engine (noise of 0 to 15 %,
+# Nats that are asked for beyond that. Filters are linearised, and dry friction has
+# kinks: of 105 recordings of seven families of objects in our own engine (noise of 0 to 15 %,
 # pin, wheel and friction unknown) one cart with a dry wheel reached 8.6 where the
 # posterior was right. Above 10 were two such carts that the fit had wrong.
 _MARGIN = 3.0
@@ -29,8 +29,8 @@ def report_residuals(
 
     A Bayes factor has a mean of one where the law is not there, so that it exceeds K /
     a with a probability under a / K (Markov's inequality): with K laws of all bodies
-    together, what exceeds that by a margin is a doubt. Correlated innovations without such a law
-    are a note: readings of real sensors are often not white.
+    together, what exceeds that by a margin is a doubt. Correlated innovations without
+    such a law are a note: readings of real sensors are often not white.
 
     Args:
         spec: the scene.
