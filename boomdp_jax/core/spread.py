@@ -32,11 +32,15 @@ class Program:
     Args:
         stages: pure functions of trees of arrays. The first takes what all calls share,
             and then the arguments of one call; every further one the tuple that the one
-            before returns, item by item.
+            before returns, item by item. A stage that is a `QuickCompile` already is
+            taken as it is: programs that share it compile it once.
     """
 
     def __init__(self, *stages: Callable[..., Any]):
-        self._stages = [QuickCompile(stage) for stage in stages]
+        self._stages = [
+            stage if isinstance(stage, QuickCompile) else QuickCompile(stage)
+            for stage in stages
+        ]
 
     def __call__(self, shared: Any, *arguments: Any) -> Any:
         """One call on the default device, its result on the host."""

@@ -6,43 +6,22 @@ import jax
 import numpy as np
 
 from boomdp_jax.core.arrays import Key, on_device
-from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.body_numbers import UNASKED, get_number, with_numbers
 from boomdp_jax.inference.contact_numbers import with_contact_numbers
+from boomdp_jax.inference.decode import decode
 from boomdp_jax.inference.evidence_report import BlockResult, report_evidence
 from boomdp_jax.inference.layout import BODY_NUMBERS
 from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.noise_level import prior_noise
 from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.residual_report import report_residuals
 from boomdp_jax.physics.constraint_spec import JOINTS, KINDS
 from boomdp_jax.physics.params import WORLD, Params, empty_params
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 NUM_PRIOR_DRAWS = 4096
 """Prior draws that a posterior carries, to judge what was identified."""
-
-
-# Draws decoded by one call of the compiled program, whatever their number.
-_DRAWS_PER_CALL = 1024
-
-
-@QuickCompile
-def _decode_some(coordinates, z, active):
-    return jax.vmap(coordinates)(z, active)
-
-
-def _decode(coordinates, z: np.ndarray, active: np.ndarray) -> Params:
-    """Params of many draws."""
-    num = len(z)
-    parts = []
-    for begin in range(0, num, _DRAWS_PER_CALL):
-        rows = np.minimum(np.arange(begin, begin + _DRAWS_PER_CALL), num - 1)
-        part = _decode_some(
-            coordinates, on_device(z[rows], z.dtype), on_device(active[rows], bool)
-        )
-        parts.append(jax.tree.map(np.asarray, part))
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:num], *parts)
 
 
 def assemble_posterior(
@@ -71,16 +50,16 @@ def assemble_posterior(
     posterior_parts, prior_parts, noise_parts, prior_noise_parts = [], [], [], []
     impulse_parts, prior_impulse_parts = [], []
     for number, result in enumerate(results):
-        block, draws, place = result
+        block, draws, place, _ = result
         target = block.target
         active = np.asarray(target.structures)[np.asarray(draws.structure[place])]
         likelihood: Any = target.log_likelihood
         coordinates = likelihood.coordinates
-        posterior_parts.append(_decode(coordinates, np.asarray(draws.z[place]), active))
+        posterior_parts.append(decode(coordinates, np.asarray(draws.z[place]), active))
         rng = host_generator(jax.random.fold_in(key, number))
         z = _prior_coordinates(rng, target)
         every = np.ones((NUM_PRIOR_DRAWS, target.structures.shape[1]), bool)
-        prior_parts.append(_decode(coordinates, z, every))
+        prior_parts.append(decode(coordinates, z, every))
         noise_parts.append(draws.noise_scale[place])
         impulse_parts.append(
             None if draws.impulse_scale is None else draws.impulse_scale[place]
@@ -257,7 +236,8 @@ def _diagnostics(
 ) -> dict:
     """Verdict over all blocks, with the worst of every number."""
     reasons, r_hat, sizes, jumps = [], [], [], []
-    for block, draws, place in results:
+    residual, doubts, further = report_residuals(spec, results)
+    for block, draws, place, _ in results:
         names = "+".join(spec.names[i] for i in block.bodies)
         verdict = draws.diagnostics[place]
         reasons += [f"{names}: {reason}" for reason in verdict.reasons]
@@ -265,12 +245,14 @@ def _diagnostics(
         sizes += list(verdict.effective_sample_size.values())
         if "jump" in verdict.acceptance:
             jumps.append(verdict.acceptance["jump"])
+    reasons += doubts
     return {
         "ok": not reasons,
         "reasons": reasons,
-        "notes": list(notes),
+        "notes": [*notes, *further],
         "method": method,
         "r_hat": max(r_hat, default=None),
         "effective_sample_size": min(sizes, default=None),
         "jump_acceptance": min(jumps, default=None),
+        "residual": residual,
     }

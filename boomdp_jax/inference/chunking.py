@@ -17,6 +17,9 @@ from jaxtyping import Array, Int
 MAX_CHUNKS = 32
 """Of one call."""
 
+CHUNK_SIZE = 64
+"""Points of a chunk."""
+
 MAX_OWNERS = 8
 """Pairs of object and structure in one call."""
 
@@ -50,7 +53,7 @@ class Chunking(NamedTuple):
         structure: np.ndarray,
         num_structures: int,
         *,
-        size: int = 64,
+        size: int = CHUNK_SIZE,
     ) -> "Chunking":
         """Sort points by object and structure.
 

@@ -8,12 +8,20 @@ are, the physics is compiled once.
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.core.spread import Program, num_at_a_time, run_each
-from boomdp_jax.inference.chunking import Chunking, for_each_chunk
+from boomdp_jax.inference.chunking import (
+    CHUNK_SIZE,
+    MAX_CHUNKS,
+    MAX_OWNERS,
+    Chunking,
+    for_each_chunk,
+)
 from boomdp_jax.inference.filtered_likelihood import without_gains
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.tracking import Gains
@@ -69,7 +77,24 @@ def _evaluate_chunks(known: _Known, owner, num, z):
     return for_each_chunk(one_chunk, known, owner, num, z)
 
 
-_LIKELIHOODS = Program(_gather, _evaluate_chunks)
+_EVALUATE = QuickCompile(_evaluate_chunks)
+_LIKELIHOODS = Program(_gather, _EVALUATE)
+
+
+def _gather_pushed(targets: StructureTarget, owners, gains, action, owner, num, z):
+    """The same with gains and wrenches of each owner's own."""
+    known, *rest = _gather(targets, owners, owner, num, z)
+    likelihood = eqx.tree_at(
+        lambda x: (x.data.steps.action, x.data.steps.commands),
+        known.likelihood,
+        (action, None),
+        is_leaf=lambda leaf: leaf is None,
+    )
+    return known._replace(likelihood=likelihood, gains=gains), *rest
+
+
+# Where commands take effect at once, what is compiled for points serves here, too.
+_PUSHED = Program(_gather_pushed, _EVALUATE)
 
 
 def log_prior_density(
@@ -128,3 +153,51 @@ def evaluate_points(
         square=gather(lambda found: found[1].square),
         innovation=gather(lambda found: found[2]) if with_innovations else None,
     )
+
+
+def pushed_innovations(
+    targets: StructureTarget,
+    index: np.ndarray,
+    structure: np.ndarray,
+    gains: Gains,
+    action: np.ndarray,
+    z: np.ndarray,
+) -> np.ndarray:
+    """Innovations of lists of points under other gains and wrenches than the targets'.
+
+    Args:
+        targets: with a `FilteredLikelihood`, stacked along a leading object axis.
+        index: object of each list.
+        structure: of each list.
+        gains: of each list, leading axis `list`, on the host.
+        action: wrenches in effect in each list, `[list, time, body, 3]` [N, N, N m].
+        z: coordinates of up to `CHUNK_SIZE` points of each list, `[list, point, dim]`.
+
+    Returns:
+        Whitened innovations `[list, point, time, 2, body, 6]`.
+    """
+    num_lists, num_points, _ = z.shape
+    # Shapes of the calls are those of `evaluate_points`, each list a chunk.
+    points = np.minimum(np.arange(CHUNK_SIZE), num_points - 1)
+    owner = np.minimum(np.arange(MAX_CHUNKS), MAX_OWNERS - 1).astype(np.int32)
+    dtype = targets.log_prior.dtype
+    inputs, counts = [], []
+    for begin in range(0, num_lists, MAX_OWNERS):
+        rows = np.minimum(np.arange(begin, begin + MAX_OWNERS), num_lists - 1)
+        owners = np.stack([index[rows], structure[rows]], axis=1).astype(np.int32)
+        counts.append(min(MAX_OWNERS, num_lists - begin))
+        inputs.append(
+            (
+                owners,
+                jax.tree.map(lambda leaf, rows=rows: leaf[rows].astype(dtype), gains),
+                action[rows].astype(dtype),
+                owner,
+                np.array(counts[-1], np.int32),
+                z[rows[owner]][:, points].astype(dtype),
+            )
+        )
+    calls = run_each(_PUSHED, targets, inputs)
+    found = [call[2][:num] for call, num in zip(calls, counts, strict=True)]
+    joined = np.concatenate(found)[:, :num_points]
+    shape = action.shape[1:3]
+    return joined.reshape(num_lists, num_points, shape[0], 2, shape[1], 6).astype(float)

@@ -6,6 +6,7 @@ import numpy as np
 
 from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.fixed_structure import structure_of_slots
+from boomdp_jax.inference.residual import ResidualCheck
 from boomdp_jax.inference.sample import BlockDraws
 from boomdp_jax.physics.params import WORLD
 from boomdp_jax.physics.scene_spec import SceneSpec
@@ -20,6 +21,8 @@ class BlockResult(NamedTuple):
     block: Block
     draws: BlockDraws
     place: int
+    residual: ResidualCheck | None = None
+    """None: it was not looked for laws that are missing."""
 
 
 def report_evidence(spec: SceneSpec, results: list[BlockResult]) -> dict:
@@ -38,7 +41,7 @@ def report_evidence(spec: SceneSpec, results: list[BlockResult]) -> dict:
         they are sampled.
     """
     tables, variance = [], 0.0
-    for block, draws, place in results:
+    for block, draws, place, _ in results:
         evidence = draws.evidence
         if evidence is None:
             return {"log_evidence_error": None, "evidence": []}

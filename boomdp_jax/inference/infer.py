@@ -23,6 +23,7 @@ from boomdp_jax.inference.likelihoods import ChosenLikelihood, choose_likelihood
 from boomdp_jax.inference.nuts import run_nuts
 from boomdp_jax.inference.outliers import outlier_notes, without_isolated
 from boomdp_jax.inference.posterior import Posterior, with_diagnostics
+from boomdp_jax.inference.residual import check_residuals
 from boomdp_jax.inference.robust_update import DEGREES_OF_FREEDOM
 from boomdp_jax.inference.sample import sample_blocks
 from boomdp_jax.inference.structure_draws import SampleSettings
@@ -97,7 +98,8 @@ def infer(
 
     Returns:
         Draws of all chains, with diagnostics: not ok, with reasons, also where two
-        estimates of odds or evidence disagree beyond their stated errors.
+        estimates of odds or evidence disagree beyond their stated errors, or where the
+        motion follows a law that the model lacks (`residual`; not with `nuts`, `svi`).
 
     Raises:
         ValueError: an unknown method or likelihood, or two that do not go together, a
@@ -287,8 +289,11 @@ def _infer_structures(
                 method=method,
                 starts=likelihood.starts,
             )
+            bar.stage("looking for further laws")
+            checks = check_residuals(stacked, draws)
             for place, (index, block) in enumerate(members):
-                results[index].append(BlockResult(block, draws, place))
+                result = BlockResult(block, draws, place, checks[place])
+                results[index].append(result)
             bar.advance(len(members))
     wall = time.perf_counter() - start
     seconds = {"compile": clock.seconds, "run": max(wall - clock.seconds, 0.0)}

@@ -269,7 +269,7 @@ def format_report(report: dict, structures: dict[str, float], num_draws: int) ->
     lines += ["", "noise of one reading (sd)"]
     for name, noise in report["noise"].items():
         parts = [
-            f"{channel.replace('_', ' ')} {_plus_minus(noise[channel])} {unit}"
+            f"{channel.replace('_', ' ')} {plus_minus(noise[channel])} {unit}"
             for channel, unit in _NOISE_UNITS.items()
             if channel in noise
         ]
@@ -280,8 +280,27 @@ def format_report(report: dict, structures: dict[str, float], num_draws: int) ->
     diagnostics = report["diagnostics"]
     reasons = "; ".join(diagnostics["reasons"])
     lines.append(f"diagnostics   {'ok' if diagnostics['ok'] else 'NOT OK: ' + reasons}")
+    lines += _further_laws(diagnostics.get("residual", []))
     lines += [f"note          {note}" for note in diagnostics.get("notes", [])]
     return "\n".join(lines)
+
+
+def _further_laws(entries: list[dict]) -> list[str]:
+    """The best law that each block's model may lack."""
+    lines = []
+    for entry in entries:
+        for best in entry["laws"][:1]:
+            numbers = ", ".join(
+                plus_minus({"mean": mean, "sd": sd})
+                for mean, sd in zip(best["coefficient"], best["sd"], strict=True)
+            )
+            name = best["law"].replace("_", " ")
+            law = f"{best['body']}: {name} {numbers} {best['unit']}".rstrip()
+            lines.append(
+                f"further law   {law}, log Bayes factor {best['log_bayes_factor']:.1f} "
+                f"(there above {entry['threshold']:.1f})"
+            )
+    return lines
 
 
 def _shift(spec: SceneSpec) -> np.ndarray:
@@ -338,11 +357,12 @@ def _quantity(summary: dict, units: list[str]) -> str:
             parts.append("unlimited")
             continue
         mark = "" if number["identified"] else " (prior)"
-        parts.append(f"{_plus_minus(number)} {unit}".rstrip() + mark)
+        parts.append(f"{plus_minus(number)} {unit}".rstrip() + mark)
     return ", ".join(parts)
 
 
-def _plus_minus(number: dict) -> str:
+def plus_minus(number: dict) -> str:
+    """Mean and sd, with two figures of the sd."""
     if number["mean"] is None or number["sd"] is None:
         return "unlimited"
     if number["sd"] == 0:

@@ -1,0 +1,173 @@
+"""Laws that a model may lack, each as the wrench that a coefficient of one would add.
+
+They are laws of one body, evaluated along the path that it was found to take. A law
+with two coefficients is a vector in the plane.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+
+class Path(NamedTuple):
+    """Where a body was in the middle of each step, and what pushed it."""
+
+    pose: Float[np.ndarray, "time 3"]
+    twist: Float[np.ndarray, "time 3"]
+    wrench: Float[np.ndarray, "time 3"]
+    """As the model has it act, world frame [N, N, N m]."""
+    change: Float[np.ndarray, "time 3"]
+    """Of the wrench from step to step, per second; none where a run begins."""
+    spread: Float[np.ndarray, "time 2"]
+    """How well velocity [m/s] and spin [rad/s] are known."""
+
+
+class Law(NamedTuple):
+    """One candidate."""
+
+    name: str
+    text: str
+    """What it says, for people; its coefficients follow."""
+    unit: str
+    wrench: Callable[[Path], list[Float[np.ndarray, "time 3"]]]
+    """Per unit of each coefficient."""
+
+
+def _along(direction: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """A force along a direction, `[time, 2]` and `[time]`."""
+    return np.column_stack([direction * size[:, None], np.zeros(len(size))])
+
+
+def _torque(size: np.ndarray) -> np.ndarray:
+    return np.column_stack([np.zeros((len(size), 2)), size])
+
+
+def _axis(path: Path, number: int) -> np.ndarray:
+    """The body's own x or y axis in the world, `[time, 2]`."""
+    angle = path.pose[:, 2] + 0.5 * np.pi * number
+    return np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def _speed(path: Path) -> np.ndarray:
+    return np.hypot(path.twist[:, 0], path.twist[:, 1])
+
+
+def _direction(path: Path) -> np.ndarray:
+    """Of the velocity; short where it is not known."""
+    size = np.sqrt(_speed(path) ** 2 + path.spread[:, 0] ** 2)
+    return path.twist[:, :2] / np.maximum(size, 1e-12)[:, None]
+
+
+def _turning(path: Path) -> np.ndarray:
+    """Sign of the spin; small where it is not known."""
+    spin = path.twist[:, 2]
+    return spin / np.maximum(np.hypot(spin, path.spread[:, 1]), 1e-12)
+
+
+def _force_along(path: Path, number: int) -> np.ndarray:
+    """Part of the applied force along the body's own x or y axis."""
+    return np.sum(path.wrench[:, :2] * _axis(path, number), axis=1)
+
+
+def _own_velocity(path: Path, number: int) -> np.ndarray:
+    return np.sum(path.twist[:, :2] * _axis(path, number), axis=1)
+
+
+def _constant(path: Path, part: int) -> np.ndarray:
+    return np.tile(np.eye(3)[part], (len(path.pose), 1))
+
+
+def _own_axis_law(letter: str, number: int) -> tuple[Law, Law]:
+    """Friction along one of the body's axes, and another mass along it."""
+    return (
+        Law(
+            f"viscous_{letter}",
+            f"a force along its own {letter} in proportion to its velocity along it",
+            "N s/m",
+            lambda p: [_along(_axis(p, number), _own_velocity(p, number))],
+        ),
+        Law(
+            f"force_gain_{letter}",
+            f"a further share of the applied force along its own {letter}",
+            "",
+            lambda p: [_along(_axis(p, number), _force_along(p, number))],
+        ),
+    )
+
+
+LAWS: tuple[Law, ...] = (
+    Law(
+        "constant_force",
+        "a constant force along x and y, as on a floor that slopes",
+        "N",
+        lambda p: [_constant(p, 0), _constant(p, 1)],
+    ),
+    Law("constant_torque", "a constant torque", "N m", lambda p: [_constant(p, 2)]),
+    Law(
+        "coulomb",
+        "a force of constant size along its velocity",
+        "N",
+        lambda p: [_along(_direction(p), np.ones(len(p.pose)))],
+    ),
+    Law(
+        "viscous",
+        "a force in proportion to its velocity",
+        "N s/m",
+        lambda p: [_along(p.twist[:, :2], np.ones(len(p.pose)))],
+    ),
+    Law(
+        "drag",
+        "a force along its velocity in proportion to the square of its speed",
+        "N s²/m²",
+        lambda p: [_along(p.twist[:, :2], _speed(p))],
+    ),
+    *_own_axis_law("x", 0),
+    *_own_axis_law("y", 1),
+    Law(
+        "spin_coulomb",
+        "a torque of constant size along its spin",
+        "N m",
+        lambda p: [_torque(_turning(p))],
+    ),
+    Law(
+        "spin_viscous",
+        "a torque in proportion to its spin",
+        "N m s/rad",
+        lambda p: [_torque(p.twist[:, 2])],
+    ),
+    Law(
+        "spin_drag",
+        "a torque along its spin in proportion to the square of that",
+        "N m s²/rad²",
+        lambda p: [_torque(p.twist[:, 2] * np.abs(p.twist[:, 2]))],
+    ),
+    Law(
+        "torque_gain",
+        "a further share of the applied torque",
+        "",
+        lambda p: [_torque(p.wrench[:, 2])],
+    ),
+    Law(
+        "delay",
+        "the applied wrench as it was before, by",
+        "s",
+        lambda p: [-p.change],
+    ),
+    Law(
+        "lever",
+        "a torque of the applied force, as if that acted off its centre of mass, in "
+        "its own frame at",
+        "m",
+        lambda p: [_torque(_force_along(p, 1)), _torque(-_force_along(p, 0))],
+    ),
+    Law(
+        "heading",
+        "a torque in proportion to sine and cosine of its angle, as of a weight or a "
+        "spring",
+        "N m",
+        lambda p: [_torque(np.sin(p.pose[:, 2])), _torque(np.cos(p.pose[:, 2]))],
+    ),
+)
+"""Candidates, the same for every body."""
