@@ -236,6 +236,8 @@ def normal_equations(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gradient of minus the log-density, and its Gauss-Newton matrix, of each point.
 
+    A uniform prior counts there by its variance, as much as leaves the matrix regular.
+
     Rows of coordinates that are not in use are those of the identity.
     """
     dim = fits.z.shape[1]
@@ -272,7 +274,9 @@ def normal_equations(
     gradient += np.where(prior, fits.z, 0.0)
     matrix = weighted @ np.swapaxes(jacobian, 1, 2)
     each = np.arange(dim)
-    matrix[:, each, each] += prior
+    # A direction that nothing tells of is as wide as all there are.
+    width = np.where(host.period > 0, host.period, np.inf)
+    matrix[:, each, each] += prior + in_use * 12.0 / width**2
     both = in_use[:, :, None] & in_use[:, None, :]
     matrix = np.where(both, matrix, np.eye(dim)[None])
     return np.where(in_use, gradient, 0.0), matrix

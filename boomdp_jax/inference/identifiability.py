@@ -113,11 +113,11 @@ def _of_block(
     host = Host.of(found.targets)
     _, matrix = normal_equations(found.targets, host, fits)
     places, labels = _numbers(sites)
-    prior = host.is_normal[places].astype(float)
-    information = matrix[0][np.ix_(places, places)] - np.diag(prior)
+    # Of a direction that is uniform over half a turn, by its variance.
+    least = 12.0 / np.where(host.period > 0, host.period, np.inf)[places] ** 2
+    least = np.where(host.is_normal[places], 1.0, least)
+    information = matrix[0][np.ix_(places, places)] - np.diag(least)
     information = 0.5 * (information + information.T)
-    # A direction that is uniform over half a turn, as wide as a normal one would be.
-    least = np.where(prior > 0, 1.0, 12.0 / np.pi**2)
     covariance = np.linalg.inv(information + np.diag(least))
     length, way = np.linalg.eigh(information)
     unseen = [

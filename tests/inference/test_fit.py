@@ -102,6 +102,21 @@ def box():
     return stack_blocks([make_block(spec, (0,), free_box(rng, 60)) for _ in range(2)])
 
 
+def test_a_heading_that_changes_nothing_is_as_wide_as_half_a_turn(wheeled):
+    structures = np.asarray(wheeled.structures[0])
+    wheel = np.flatnonzero(structures.any(axis=1))[:1]
+    host = Host.of(wheeled)
+    heading = host.period > 0
+    # With such a limit to its friction a wheel has none.
+    z = np.where(host.in_use[wheel] & ~heading, -60.0, 0.0)
+    z[:, 0] = 0.0
+    fits = make_fits(wheeled, np.zeros(1, int), wheel, z)
+    _, matrix = normal_equations(wheeled, host, fits)
+    assert heading.sum() == 1
+    np.testing.assert_allclose(matrix[0, heading, heading], 12.0 / np.pi**2, rtol=1e-3)
+    assert np.linalg.eigvalsh(matrix[0])[0] > 0.9
+
+
 def test_climb_reaches_the_maximum_that_scipy_finds(box):
     start = make_fits(box, np.arange(2), np.zeros(2, int), np.array([[1.5], [-1.0]]))
     found = climb(box, start, 12)
