@@ -1,4 +1,4 @@
-"""Simulation-based calibration of `infer`, and that it would notice what it should.
+"""Simulation-based calibration, all stages from fits to noise, and a planted mistake.
 
 Boxes are drawn from the prior: density, wheel, friction of the floor, and which of them
 exist; noise, too. Readings are of single steps from states that are known exactly,
@@ -10,6 +10,7 @@ Validating Bayesian inference algorithms with simulation-based calibration; Modr
 al. (2023), Simulation-based calibration checking for Bayesian computation.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -17,11 +18,13 @@ import numpy as np
 import pytest
 from jaxtyping import Array
 
-import boomdp_jax
-from boomdp_jax.core.history import make_history
-from boomdp_jax.inference import Posterior
+from boomdp_jax.inference import enumerate_structures
+from boomdp_jax.inference.adapt_mixture import adapt_mixtures
+from boomdp_jax.inference.exact_starts import ExactStarts
+from boomdp_jax.inference.sample import sample_blocks
+from boomdp_jax.inference.structure_draws import SampleSettings
 from boomdp_jax.physics import Params, State, step
-from tests.inference.prior_objects import DT, PriorObjects, box_scene, draw_objects
+from tests.inference.prior_objects import PriorObjects, draw_objects
 from tests.reference.ranks import NUM_DRAWS, rank, thin, uniformity
 
 pytestmark = pytest.mark.slow
@@ -34,8 +37,11 @@ CAUGHT = 1e-6
 """A planted mistake counts as caught where chance would do as much this rarely."""
 
 
+SETTINGS = SampleSettings(num_chains=1, num_samples=96, num_importance=512)
+
+
 class Draws(NamedTuple):
-    """Of one object, leading axis `draw`."""
+    """Of all objects, leading axes `object` and `draw`."""
 
     params: Params
     noise_scale: np.ndarray
@@ -46,42 +52,70 @@ def objects() -> PriorObjects:
     return draw_objects(np.random.default_rng(41), NUM_OBJECTS, NUM_ROWS)
 
 
+@jax.jit
+def _decode(coordinates, z: Array, active: Array) -> Params:
+    """Params of hypotheses `[object, draw]`."""
+    over_draws = jax.vmap(lambda c, z, active: c(z, active), (None, 0, 0))
+    return jax.vmap(over_draws)(coordinates, z, active)
+
+
+def decoded(objects: PriorObjects, structure, z, noise_scale) -> Draws:
+    """Hypotheses with leading axes `object` and `draw`."""
+    coordinates = objects.targets.log_likelihood.coordinates
+    active = np.asarray(objects.targets.structures[0])[structure]
+    return Draws(_decode(coordinates, z, active), noise_scale)
+
+
 @pytest.fixture(scope="module")
 def truths(objects) -> Draws:
-    """Leading axis `object`."""
-    coordinates = objects.targets.log_likelihood.coordinates
-    active = np.asarray(objects.targets.structures[0])[objects.structure]
-    decode = jax.jit(jax.vmap(lambda c, z, active: c(z, active)))
-    params = decode(coordinates, objects.z, active)
-    return Draws(params, objects.noise_scale[:, None])
-
-
-@pytest.fixture(scope="module")
-def posteriors(objects) -> list[Posterior]:
-    return boomdp_jax.infer_batch(
-        jax.random.key(42),
-        [box_scene()] * NUM_OBJECTS,
-        objects.histories,
-        method="enumerate",
-        likelihood="one-step",
-        num_chains=1,
-        num_samples=256,
+    """One draw of each object."""
+    return decoded(
+        objects,
+        objects.structure[:, None],
+        objects.z[:, None],
+        objects.noise_scale[:, None, None],
     )
 
 
 @pytest.fixture(scope="module")
-def prior() -> Posterior:
-    """A posterior without data; of as many draws as all objects need."""
-    blank = np.zeros((0, 1, 6))
-    history = make_history(blank, blank[..., :3], blank, DT, capacity=4)
-    return boomdp_jax.infer(
-        jax.random.key(43),
-        box_scene(),
-        history,
-        method="enumerate",
-        likelihood="one-step",
-        num_samples=1000,
+def posteriors(objects) -> Draws:
+    """As many of each as ranks need, by all stages from fits to noise."""
+    with pytest.MonkeyPatch.context() as patch:
+        # Rounds of adaptation make weights more even and nothing more exact; six
+        # of them would take most of the test's time.
+        few = functools.partial(adapt_mixtures, max_rounds=1)
+        patch.setattr(enumerate_structures, "adapt_mixtures", few)
+        found = sample_blocks(
+            jax.random.key(42),
+            objects.targets,
+            SETTINGS,
+            method="enumerate",
+            starts=ExactStarts(1),
+        )
+    rng = np.random.default_rng(44)
+    rows = np.stack([thin(rng, found.structure.shape[1]) for _ in found.structure])
+    each = np.arange(len(rows))[:, None]
+    return decoded(
+        objects,
+        found.structure[each, rows],
+        found.z[each, rows],
+        found.noise_scale[each, rows],
     )
+
+
+@pytest.fixture(scope="module")
+def priors(objects) -> Draws:
+    """Draws that ignore the data, of hypotheses and noise."""
+    rng = np.random.default_rng(43)
+    targets, shape = objects.targets, (NUM_OBJECTS, NUM_DRAWS)
+    probability = np.exp(np.asarray(targets.log_prior[0], float))
+    structure = rng.choice(len(probability), size=shape, p=probability)
+    period = np.asarray(targets.period[0])
+    turn = period * (rng.random((*shape, len(period))) - 0.5)
+    z = np.where(period > 0, turn, rng.standard_normal(turn.shape))
+    scale = np.asarray(targets.log_likelihood.coordinates.scales.noise)[0]
+    variance = scale**2 / rng.gamma(1.0, size=(*shape, 1, 4))
+    return decoded(objects, structure, z, np.sqrt(variance))
 
 
 @jax.jit
@@ -134,20 +168,10 @@ def statistics(objects: PriorObjects, draws: Draws) -> dict[str, np.ndarray]:
     }
 
 
-def chances(
-    objects: PriorObjects, truths: Draws, posteriors: list[Posterior]
-) -> dict[str, float]:
-    """Chance of ranks as uneven as those of the truths among draws of posteriors."""
-    rng = np.random.default_rng(44)
-    kept = []
-    for posterior in posteriors:
-        rows = thin(rng, posterior.num_draws)
-        drawn = Draws(posterior.params, np.asarray(posterior.noise_scale))
-        kept.append(jax.tree.map(lambda leaf, r=rows: np.asarray(leaf)[r], drawn))
-    draws = jax.tree.map(lambda *leaves: np.stack(leaves), *kept)
-    others = statistics(objects, draws)
-    truths = jax.tree.map(lambda leaf: np.asarray(leaf)[:, None], truths)
-    found = {}
+def chances(objects: PriorObjects, truths: Draws, draws: Draws) -> dict[str, float]:
+    """Chance of ranks as uneven as those of the truths among draws."""
+    rng = np.random.default_rng(45)
+    others, found = statistics(objects, draws), {}
     for name, true in statistics(objects, truths).items():
         ranks = [
             rank(rng, mine[0], theirs)
@@ -158,21 +182,20 @@ def chances(
 
 
 def test_ranks_of_the_truth_are_uniform(objects, truths, posteriors):
-    assert all(posterior.num_draws >= NUM_DRAWS for posterior in posteriors)
     found = chances(objects, truths, posteriors)
     assert min(found.values()) > FALSE_ALARM / len(found), found
 
 
 def test_returning_the_prior_is_caught_by_the_log_likelihood_alone(
-    objects, truths, prior
+    objects, truths, priors
 ):
-    found = chances(objects, truths, [prior] * NUM_OBJECTS)
+    found = chances(objects, truths, priors)
     assert found.pop("log-likelihood") < CAUGHT
     assert min(found.values()) > FALSE_ALARM / len(found), found
 
 
-def test_posteriors_have_learnt(truths, posteriors):
+def test_posteriors_have_learnt(posteriors):
     """Else they would be the prior, and uniform ranks no news."""
-    sd = [np.log(np.asarray(p.params.density)[:, 0]).std() for p in posteriors]
+    sd = np.log(np.asarray(posteriors.params.density)[..., 0]).std(axis=1)
     # The prior's is 1.5.
     assert np.median(sd) < 0.15
