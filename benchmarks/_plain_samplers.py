@@ -158,7 +158,7 @@ def metropolis(
     xs = jax.block_until_ready(run(keys))
     seconds = {"compile": middle - start, "run": time.perf_counter() - middle}
     num_calls = num_chains * (num_iterations + 1) * problem.calls_each
-    posterior = _posterior(problem, spec, xs, log_density, seconds, "metropolis")
+    posterior = as_posterior(problem, spec, xs, log_density, seconds, "metropolis")
     return PlainResult(posterior, num_calls, seconds)
 
 
@@ -211,11 +211,11 @@ def blackjax_smc(
         return problem.log_prior(x) + problem.log_likelihood(x)
 
     xs = state.particles.reshape(4, -1, problem.size)
-    posterior = _posterior(problem, spec, xs, log_density, seconds, "blackjax")
+    posterior = as_posterior(problem, spec, xs, log_density, seconds, "blackjax")
     return PlainResult(posterior, calls, seconds)
 
 
-def _posterior(
+def as_posterior(
     problem: PlainProblem, spec: SceneSpec, xs, log_density, seconds: dict, method: str
 ) -> Posterior:
     """Draws `[chain, draw, size]` as a posterior."""

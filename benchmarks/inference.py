@@ -4,11 +4,13 @@ MuJoCo pushes random objects of several families, 50 noisy transitions each. All
 see the same readings. The papers' recipe is plain Metropolis from prior draws (30
 chains of 20,000), one noise scale for everything, constraints that are always there and
 nulled by a value; BlackJAX (where installed) tempers 2,048 particles of the same
-density. Given the true structure, NUTS and SVI stand beside them. Last comes the
-ablation of what jumps between structures propose: births from the prior, from one fit
-of each structure, or from the adapted mixture of all modes.
+density, and `sbi` (where installed) trains a neural posterior estimator on simulations
+of the same pushes. Given the true structure, NUTS and SVI stand beside them. Last comes
+the ablation of what jumps between structures propose: births from the prior, from one
+fit of each structure, or from the adapted mixture of all modes.
 """
 
+import argparse
 import contextlib
 import importlib.util
 import time
@@ -19,6 +21,7 @@ import jax
 import numpy as np
 from _ablation import PROPOSALS, Ablation, ablate
 from _information import log_mass_bound
+from _neural import neural_posterior
 from _plain_samplers import blackjax_smc, metropolis
 from _report import Reporter, parser_of
 from _scores import ObjectScore, score_object
@@ -27,6 +30,7 @@ from structure_recovery import make_objects
 
 from boomdp_jax.core.history import History
 from boomdp_jax.inference import evaluate, filter_points
+from boomdp_jax.inference.chunking import CHUNK_SIZE
 from boomdp_jax.inference.infer import infer
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.interop.object_families import FAMILIES, hide
@@ -34,7 +38,8 @@ from boomdp_jax.interop.recording import READING_NOISE, with_reading_noise
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 OURS = ("rj", "enumerate", "smc", "laplace", "map")
-RIVALS = ("metropolis", "blackjax")
+RIVALS = ("metropolis", "blackjax", "npe")
+_NEEDS = {"blackjax": "blackjax", "npe": "sbi"}
 GIVEN = ("nuts", "svi")
 """Told the true structure."""
 METHODS = OURS + GIVEN + RIVALS
@@ -59,12 +64,14 @@ def main() -> None:
     parser.add_argument("--families", nargs="+", choices=FAMILIES, default=FAMILIES)
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
     parser.add_argument("--iterations", type=int, default=20_000)
+    parser.add_argument("--simulations", type=int, default=20_000, help="of `npe`")
     parser.add_argument("--ablated", type=int, default=7, help="objects of the table")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     if arguments.quick:
         arguments.objects, arguments.ablated = 2, 1
         arguments.families, arguments.iterations = ("cart", "table"), 500
+        arguments.simulations = 1000
     reporter = Reporter(arguments.out)
     objects = make_objects(
         arguments.families, arguments.objects, NUM_ROWS, arguments.seed
@@ -82,9 +89,10 @@ def main() -> None:
     ]
     probabilities = {}
     for method in arguments.methods:
-        if method == "blackjax" and importlib.util.find_spec("blackjax") is None:
+        needed = _NEEDS.get(method)
+        if needed is not None and importlib.util.find_spec(needed) is None:
             continue
-        runner = _runner(method, arguments.iterations)
+        runner = _runner(method, arguments)
         runs = []
         for place, (family, truth, _) in enumerate(objects):
             key = jax.random.key(1000 * arguments.seed + place)
@@ -98,7 +106,7 @@ def main() -> None:
     reporter.print_table()
 
 
-def _runner(method: str, num_iterations: int) -> Callable[..., tuple]:
+def _runner(method: str, arguments: argparse.Namespace) -> Callable[..., tuple]:
     """A function of key, scene and history to posterior, calls and seconds."""
 
     def ours(key, truth: SceneSpec, history: History):
@@ -121,7 +129,15 @@ def _runner(method: str, num_iterations: int) -> Callable[..., tuple]:
     def plain(key, truth: SceneSpec, history: History):
         spec = hide(truth)
         if method == "metropolis":
-            found = metropolis(key, spec, history, num_iterations=num_iterations)
+            found = metropolis(key, spec, history, num_iterations=arguments.iterations)
+        elif method == "npe":
+            found = neural_posterior(
+                key,
+                spec,
+                history,
+                num_simulations=arguments.simulations,
+                num_epochs=10 if arguments.quick else 200,
+            )
         else:
             found = blackjax_smc(key, spec, history)
         return found.posterior, found.num_calls, found.seconds["run"]
@@ -143,12 +159,19 @@ def counted_calls() -> Iterator[list[int]]:
     count = [0]
     originals = evaluate.run_each, filter_points.run_each
 
+    def num_points(program, arguments: tuple) -> int:
+        """Of one call; see what the first stages of these programs take."""
+        if program is filter_points._FILTERS:
+            return len(arguments[0])
+        place = 4 if program is evaluate._PUSHED else 2
+        return int(arguments[place]) * CHUNK_SIZE
+
     def counting(original: Callable[..., Any], each_row: Callable[[Any], int]):
         def run(program, targets, inputs):
             data = targets.log_likelihood.data
             rows, bodies = data.steps.state.shape[1:3]
             for arguments in inputs:
-                points = int(np.prod(np.shape(arguments[2])[:-1]))
+                points = num_points(program, arguments)
                 count[0] += points * rows * each_row(bodies)
             return original(program, targets, inputs)
 

@@ -94,7 +94,13 @@ def test_infer_prints_one_json_line_a_recording_in_order(
     command = "infer three.npz five.npz --scene scene.json --json --method rj"
     assert main(command.split()) == 0
     output = capsys.readouterr()
-    expected = {"bound": None, "method": "rj", "progress": True}
+    expected = {
+        "bound": None,
+        "horizon": None,
+        "likelihood": "auto",
+        "method": "rj",
+        "progress": True,
+    }
     assert [json.loads(line) for line in output.out.splitlines()] == [
         {"rows": 3, **expected},
         {"rows": 5, **expected},
