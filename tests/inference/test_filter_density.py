@@ -91,6 +91,7 @@ def test_bodies_that_are_not_tied_are_independent():
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_bodies_that_are_tied_are_filtered_as_by_the_other_filter():
     each = [free_box(np.random.default_rng(seed), 8) for seed in (4, 5)]
     tie = {"type": "revolute", "a": "a", "b": "b"}

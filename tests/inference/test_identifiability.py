@@ -18,6 +18,7 @@ QUICK = FitSettings(num_draws=16, num_starts=2, num_iterations=6)
 SPREAD = 1.5
 
 
+@pytest.mark.slow
 def test_information_about_a_mass_is_that_of_the_joint_density():
     history = free_box(np.random.default_rng(3), 40)
     (found,) = identifiability(jax.random.key(0), box_scene(), history, settings=QUICK)
@@ -44,6 +45,7 @@ def at_rest(num_rows: int):
     return make_history(reading[:-1], action, reading[1:], DT)
 
 
+@pytest.mark.slow
 def test_nothing_is_told_of_the_mass_of_a_box_at_rest():
     (found,) = identifiability(
         jax.random.key(0), box_scene(), at_rest(12), settings=QUICK
@@ -75,6 +77,7 @@ def pendulum(constraints: list[dict], **body):
     )
 
 
+@pytest.mark.slow
 def test_a_swing_tells_where_the_pin_is_and_nothing_of_the_mass():
     """Gravity and friction are in proportion to it: it drops out."""
     place = np.array([0.2, 0.1])

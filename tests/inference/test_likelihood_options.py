@@ -125,6 +125,7 @@ def pushed_box(is_chained: bool, has_gaps: bool) -> History:
 @pytest.mark.parametrize("has_gaps", [False, True], ids=["whole", "gaps"])
 @pytest.mark.parametrize("is_chained", [True, False], ids=["one", "two"])
 @pytest.mark.parametrize("horizon", [1, 2, 4, 30, None])
+@pytest.mark.slow
 def test_log_likelihoods_are_those_of_rollouts(horizon, is_chained, has_gaps):
     """Of the engine, at hypotheses with and without a wheel and floor friction.
 

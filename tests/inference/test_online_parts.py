@@ -181,6 +181,7 @@ def test_effective_sample_size_of_equal_and_of_single_weights():
     assert float(effective_sample_size(one)) == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_the_mixture_is_fitted_to_the_particles_of_each_structure():
     target, design, data = make_problem()
     _, probability, means, covariances = closed_form(design, data)

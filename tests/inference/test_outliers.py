@@ -146,6 +146,7 @@ def particle_density(rng, history: History, mass: float, num: int = 20_000) -> f
     return log_total
 
 
+@pytest.mark.slow
 def test_the_marginal_likelihood_is_that_of_a_particle_filter():
     """Of a linear case with gross errors; also as a function of the mass."""
     rng = np.random.default_rng(0)

@@ -147,6 +147,7 @@ def test_positions_alone_and_steps_of_any_length_will_do():
     assert found.num_rows == 96
 
 
+@pytest.mark.slow
 def test_padding_changes_nothing_and_few_rows_are_left_alone():
     rng = np.random.default_rng(5)
     history = worlds.record_box(rng, 40, worlds.viscous(3.0))
@@ -182,6 +183,7 @@ def test_a_density_that_is_free_absorbs_a_mass_and_no_more():
     assert best.law.name in ("force_gain_x", "force_gain_y", "torque_gain")
 
 
+@pytest.mark.slow
 def test_dry_friction_is_not_viscous():
     """A model whose friction may only be viscous takes up what it can of it.
 

@@ -86,6 +86,7 @@ def test_numpyro_run_resumes_to_the_same_bits(kernel):
     np.testing.assert_array_equal(z, whole.get_samples(group_by_chain=True)["z"])
 
 
+@pytest.mark.slow
 def test_numpyro_single_chain_shows_progress_and_postprocesses(capsys):
     target, mixture = linear_case()
     kernel = StructureKernel(

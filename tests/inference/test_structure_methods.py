@@ -71,6 +71,7 @@ def drawn(method: str, key: int = 3, shift: float = 0.7, tightness: float = 0.8)
 
 
 @pytest.mark.parametrize("method", WITH_ERRORS)
+@pytest.mark.slow
 def test_evidence_agrees_with_the_closed_form(method):
     _, truths = problem()
     evidence = drawn(method).evidence

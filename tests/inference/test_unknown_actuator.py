@@ -100,6 +100,7 @@ def test_gains_biases_and_delays_lie_where_their_posteriors_say():
     assert low < np.sum(squares) < high
 
 
+@pytest.mark.slow
 def test_a_gain_and_a_mass_are_told_apart_by_nothing_but_the_mass():
     """Their product with opposite powers is seen, the other direction is not."""
     body = {"name": "box", "shape": {"type": "box", "half_extents": [0.3, 0.2]}}

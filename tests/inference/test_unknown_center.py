@@ -102,6 +102,7 @@ def test_known_centres_of_mass_leave_params_as_they_were():
     assert block.layout.numbers == ()
 
 
+@pytest.mark.slow
 def test_pushes_tell_mass_and_centre_and_a_body_at_rest_neither():
     rng = np.random.default_rng(1)
     history = pushes(rng, np.array([0.05, -0.03]), 30)
@@ -174,6 +175,7 @@ def test_a_saved_centre_of_mass_comes_back_to_the_bit(tmp_path):
         load_posterior(tmp_path / "half.npz")
 
 
+@pytest.mark.slow
 def test_a_predicted_transition_turns_about_the_centre_of_mass():
     """A push at the middle makes a box turn by the arm over the inertia."""
     posterior = center_posterior()

@@ -117,6 +117,7 @@ def test_a_pendulum_swings_as_one_whose_centre_of_mass_is_given():
 
 
 @pytest.mark.parametrize("num_bodies", [1, 2])
+@pytest.mark.slow
 def test_ground_and_ties_are_those_of_a_given_centre_of_mass(num_bodies):
     ground = {"type": "ground", "a": "box0", "dry": 0.2, "viscous": 50.0}
     tie = {"type": "revolute", "a": "box1", "b": "box0"}

@@ -232,6 +232,7 @@ def test_batch_agrees_with_one_by_one_and_repeats_bit_for_bit():
         assert np.allclose(single(shift)[0].pose, states.pose[i], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_step_by_step_with_the_cache_is_the_rollout():
     spec = spec_of(
         FLOOR,

@@ -87,6 +87,7 @@ def _cases(names, quick):
 
 
 @pytest.mark.parametrize("name", _cases(CASES, ("free", "wheel")))
+@pytest.mark.slow
 def test_both_modes_agree_with_finite_differences(name):
     world, twist, push = CASES[name]
     numbers, params = numbers_of(world, twist, push)
@@ -142,6 +143,7 @@ AWKWARD = {
 
 
 @pytest.mark.parametrize("name", AWKWARD)
+@pytest.mark.slow
 def test_gradients_are_finite_at_kinks(name, precision):
     world, twist, push = AWKWARD[name]
     numbers, params = numbers_of(world, twist, push)
@@ -152,6 +154,7 @@ def test_gradients_are_finite_at_kinks(name, precision):
 
 
 @pytest.mark.parametrize("name", ["slipping wheel", "pin", "rod"])
+@pytest.mark.slow
 def test_single_precision_gradients_are_close_to_double_ones(name):
     world, twist, push = CASES[name]
 

@@ -131,6 +131,7 @@ def test_a_motor_turns_a_hinge_up_with_its_torque():
     assert np.max(np.asarray(info.constraint_error)) < 1e-6
 
 
+@pytest.mark.slow
 def test_a_hinge_stops_at_its_limits():
     hinge = tie("revolute", anchor_a=(-0.2, 0.0), lower=-1.0, upper=0.5)
     states, _ = run(make_spec([box(pose=(0.2, 0.0, 0.0))], [hinge]), 100)
@@ -161,6 +162,7 @@ def test_welded_boxes_move_as_one_body():
     assert np.max(np.asarray(info.constraint_error)) < 1e-7
 
 
+@pytest.mark.slow
 def test_a_guide_between_two_bodies_keeps_both_momenta():
     bodies = [box("a"), box("b", (0.1, 0.3, 0.0))]
     guide = tie("prismatic", "b", "a", anchor_b=(0.1, 0.3), axis=0.3, viscous=0.5)
@@ -178,6 +180,7 @@ def test_a_guide_between_two_bodies_keeps_both_momenta():
     assert np.max(np.asarray(info.constraint_error)) < 1e-7
 
 
+@pytest.mark.slow
 def test_inactive_slots_change_nothing():
     free = make_spec([box("a"), box("b", (1.0, 0.0, 0.0))], [])
     ties = [

@@ -124,6 +124,7 @@ def test_fast_path_agrees_with_the_general_one(paths, kind):
             assert np.max(worst[~has_floor]) < 1e-9
 
 
+@pytest.mark.slow
 def test_a_weld_holds_its_pose_to_the_bit_whatever_was_read(paths):
     params, state, wrench = cases("weld")
     pose = state.pose + 0.003 * jax.random.normal(jax.random.key(1), state.pose.shape)

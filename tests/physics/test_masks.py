@@ -53,6 +53,7 @@ def push(params: Params):
 
 
 @pytest.mark.parametrize("kept", [None, *KINDS])
+@pytest.mark.slow
 def test_what_an_inactive_slot_holds_does_not_matter_to_the_bit(kept, precision):
     off = {kind: kind == kept for kind in KINDS}
     params = switched(make_params(FULL), off)
@@ -65,6 +66,7 @@ def test_what_an_inactive_slot_holds_does_not_matter_to_the_bit(kept, precision)
     np.testing.assert_array_equal(info.constraint_error, expected_info.constraint_error)
 
 
+@pytest.mark.slow
 def test_slots_that_are_not_used_do_not_change_the_motion():
     world = FULL.with_(pins=[], rods=[], grounds=[])
     scene, state = one_foot(world), make_state(START, TWIST)
@@ -75,6 +77,7 @@ def test_slots_that_are_not_used_do_not_change_the_motion():
     np.testing.assert_allclose(narrow.twist, wide.twist, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_body_without_active_slots_flies_freely():
     params = switched(make_params(FULL), dict.fromkeys(KINDS, False))
     states, info = push(params)

@@ -171,6 +171,7 @@ def joined_start() -> tuple[np.ndarray, np.ndarray]:
     return pose, np.array([[*velocity, spin_a], [*other, spin_b]])
 
 
+@pytest.mark.slow
 def test_two_joined_bodies_conserve_momentum(precision):
     pose, twist = joined_start()
     trajectory = run(JOINED, pose, twist, num_steps=100)
@@ -183,6 +184,7 @@ def test_two_joined_bodies_conserve_momentum(precision):
     assert np.max(drifts) < 1e-4
 
 
+@pytest.mark.slow
 def test_angular_momentum_of_joined_bodies_converges_to_second_order():
     pose, twist = joined_start()
     start = momentum(JOINED, pose, twist)[2]
@@ -206,6 +208,7 @@ DOUBLE = World(
 DOUBLE_START = np.array([[0.2, 0.0, 0.0], [0.65, 0.0, 0.0]])
 
 
+@pytest.mark.slow
 def test_double_pendulum_keeps_its_energy(precision):
     trajectory = run(DOUBLE, DOUBLE_START, num_steps=200, dt=0.01)
     now = energy(DOUBLE, trajectory.pose, trajectory.twist)
@@ -214,6 +217,7 @@ def test_double_pendulum_keeps_its_energy(precision):
     assert np.max(np.abs(now - start)) < 0.01 * depth.sum()
 
 
+@pytest.mark.slow
 def test_double_pendulum_follows_lagrange_multipliers_to_second_order():
     errors = []
     for dt in (0.02, 0.01, 0.005):

@@ -124,6 +124,7 @@ def test_structures_are_masks_and_nothing_is_traced_again():
     assert num_traces == 1
 
 
+@pytest.mark.slow
 def test_a_removed_partner_frees_its_joint():
     content = make_spec(("bar", "low")).to_dict()
     content["constraints"][0] |= {"b": "low", "anchor_b": [0.3, 0.4]}

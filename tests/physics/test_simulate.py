@@ -206,6 +206,7 @@ def test_twists_are_shaken_by_what_was_asked(is_per_body):
                 np.testing.assert_allclose(shakes[:, body, axis], 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_shaken_joints_hold():
     scene, params = make_scene(PAIR), make_params(PAIR)
     noise = SimulationNoise(

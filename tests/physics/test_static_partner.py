@@ -44,6 +44,7 @@ def _swing(partner: str, kind: str):
 
 
 @pytest.mark.parametrize("kind", ["revolute", "distance"])
+@pytest.mark.slow
 def test_joint_with_a_static_body_is_one_with_the_world(kind):
     pose, error = _swing("post", kind)
     expected, _ = _swing("world", kind)
