@@ -25,8 +25,9 @@ from boomdp_jax.inference.kalman import (
     start_scale,
 )
 from boomdp_jax.inference.robust_update import correct_robustly, move
-from boomdp_jax.inference.track_data import TrackData, with_delay
+from boomdp_jax.inference.track_data import TrackData, TrackRow, with_delay
 from boomdp_jax.inference.tracking import (
+    Predict,
     channel_difference,
     channel_differences,
     cloud_predictor,
@@ -107,7 +108,7 @@ def _density_of_one_body(
     scene: Scene, params: Params, data: TrackData, noise: NoiseLevel
 ) -> FloatScalar:
     """The same channel by channel, each a vector in a batch of points."""
-    predict = predictor(scene, params, data.steps.dt)
+    predict = _cloud_of_channels(predictor(scene, params, data.steps.dt), data.rows)
     scale = channel_scale(noise.reading).reshape(-1)
     at_first = list((start_factor(data.freedom) * scale) ** 2)
     unknown = list(start_scale(1) ** 2)
@@ -132,11 +133,7 @@ def _density_of_one_body(
         )
         state = [x + move for x, move in zip(state, shift, strict=True)]
         points = [x + offsets[:, i] for i, x in enumerate(state)]
-        images = jax.vmap(
-            lambda *point: split_channels(
-                predict(join_channels(point), row.action, row.dt)
-            )
-        )(*points)
+        images = predict(points, row)
         state = [image[0] for image in images]
         shift, lower, last_density = move_and_correct_channels(
             lower,
@@ -156,6 +153,26 @@ def _density_of_one_body(
     lower = [[one if i == j else zero for j in range(i + 1)] for i in num]
     carry = ([zero for _ in num], lower, zero)
     return jax.lax.scan(advance, carry, data.rows)[0][2]
+
+
+def _cloud_of_channels(predict: Predict, rows: TrackRow):
+    """One step of an estimate and its six neighbours, each channel a vector.
+
+    What a hypothesis has worked out beforehand is copied for each of the seven here,
+    once, and not in every row.
+    """
+
+    def one(row: TrackRow, *point):
+        return split_channels(predict(join_channels(point), row.action, row.dt))
+
+    first = jax.tree.map(lambda leaf: leaf[0], rows)
+    pure, known = jax.closure_convert(one, first, *jnp.zeros(6))
+    known = [jnp.broadcast_to(leaf, (7, *leaf.shape)) for leaf in known]
+
+    def predict_all(points: list, row: TrackRow) -> list:
+        return jax.vmap(lambda point, known: pure(row, *point, *known))(points, known)
+
+    return predict_all
 
 
 def _correct(covariance, miss, mask, variance, freedom: float | None):

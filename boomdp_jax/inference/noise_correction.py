@@ -25,7 +25,7 @@ from boomdp_jax.inference.fit import Fits, Host
 from boomdp_jax.inference.noise_level import NoiseFit, log_noise_prior
 from boomdp_jax.inference.noise_proposal import NoiseProposal
 from boomdp_jax.inference.resampling import systematic
-from boomdp_jax.inference.structure_evidence import StructureEvidence
+from boomdp_jax.inference.structure_evidence import StructureEvidence, reweighed
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.tempered_smc import next_step, times
 
@@ -36,6 +36,9 @@ _MOVES_BETWEEN, _LAST_MOVES = 1, 2
 _GOOD_SHARE = 0.5
 # Lengths of steps relative to the best for a normal density, tried in turn.
 _STEP_SIZES = (1.0, 0.4)
+# Lineages below which draws are moved on, at most so often, until they are less like
+# what they were than this; and likeness beyond which a result is doubted.
+_FEW_LINEAGES, _MOST_MOVES, _MOST_ALIKE, _TOO_ALIKE = 50.0, 24, 0.5, 0.8
 # Draws of a group from which its spread is taken.
 _LEAST_GROUP = 4
 # Distinct draws that are left of all, below which a result is doubted.
@@ -135,8 +138,9 @@ def infer_noise(
         for number in range(num_moves):
             size = _STEP_SIZES[(steps + number) % len(_STEP_SIZES)]
             draws = problem.move(rng, draws, power, size)
+    draws, likeness = problem.spread(rng, draws, power)
     shape = structure.shape
-    changed = _changed(
+    changed = reweighed(
         evidence,
         before.reshape(shape),
         draws.structure.reshape(shape),
@@ -149,6 +153,12 @@ def infer_noise(
         if power[i] < 1.0:
             reasons[i].append(
                 f"inferring the noise ended at a power of {power[i]:.3g}, not at 1"
+            )
+        if likeness[i] > _TOO_ALIKE:
+            reasons[i].append(
+                f"inferring the noise left few lineages of draws, which {_MOST_MOVES} "
+                f"moves did not part: a correlation of {likeness[i]:.2f} with where "
+                "they were"
             )
         if left[i] < _LEAST_LEFT * structure[0].size:
             reasons[i].append(
@@ -250,6 +260,42 @@ class _Problem:
         is_accepted = np.log(rng.random(len(gain))) < gain
         return trial.where(is_accepted, draws)
 
+    def spread(
+        self, rng, draws: _Draws, power: np.ndarray
+    ) -> tuple[_Draws, np.ndarray]:
+        """Move on the draws of objects of which few lineages are left.
+
+        Draws of one lineage are alike, those of a few cover less than the posterior.
+        They are moved until little is left of where they were.
+
+        Returns:
+            The draws, and the largest correlation of any number before and after, of
+            each object; zero where there was no need.
+        """
+        likeness = np.zeros(len(power))
+        num_objects = len(power)
+        size = _lineages(draws.root.reshape(num_objects, -1))
+        asked = np.flatnonzero(size < _FEW_LINEAGES)
+        if not asked.size:
+            return draws, likeness
+        rows = np.flatnonzero(np.isin(self._index, asked))
+        few, index = draws.take(rows), self._index[rows]
+        problem = _Problem(self._targets, index)
+        problem._proposal = self._proposal
+        begin = np.concatenate([few.z, few.vector], axis=1)
+        for number in range(_MOST_MOVES):
+            few = problem.move(rng, few, power, _STEP_SIZES[number % len(_STEP_SIZES)])
+            here = np.concatenate([few.z, few.vector], axis=1)
+            for i in asked:
+                own = index == i
+                likeness[i] = _likeness(begin[own], here[own])
+            if np.all(likeness < _MOST_ALIKE):
+                break
+        joined = [np.array(part) for part in draws]
+        for whole, part in zip(joined, few, strict=True):
+            whole[rows] = part
+        return _Draws(*joined), likeness
+
     def _log_last(self, structure, z, vector) -> np.ndarray:
         noise = NoiseFit.of_vector(vector)
         value = filter_densities(self._targets, self._index, structure, z, noise)
@@ -275,6 +321,20 @@ class _Problem:
         step[:, :dim] = self._host.wrap(step[:, :dim])
         stretch = size * np.exp(rng.standard_normal((len(num), 1)) * 0.5)
         return np.where((num >= _LEAST_GROUP)[:, None], stretch * step, 0.0)
+
+
+def _lineages(root: np.ndarray) -> np.ndarray:
+    """How many lineages of equal size would be as uneven, `[object]`."""
+    counts = [np.unique(each, return_counts=True)[1] for each in root]
+    return np.array([num.sum() ** 2 / (num**2).sum() for num in counts], float)
+
+
+def _likeness(before: np.ndarray, after: np.ndarray) -> float:
+    """Largest correlation of any number, `[draw, number]` before and after moves."""
+    a, b = before - before.mean(axis=0), after - after.mean(axis=0)
+    length = np.sqrt(np.sum(a**2, axis=0) * np.sum(b**2, axis=0))
+    seen = length > 0
+    return float(np.max(np.sum(a * b, axis=0)[seen] / length[seen], initial=0.0))
 
 
 def _ratio(draws: _Draws) -> np.ndarray:
@@ -308,63 +368,3 @@ def _size(log_weight: np.ndarray) -> float:
         return 0.0
     weight = np.exp(log_weight - top)
     return float(weight.sum() ** 2 / (weight**2).sum())
-
-
-def _changed(
-    evidence: StructureEvidence,
-    before: np.ndarray,
-    after: np.ndarray,
-    log_share: np.ndarray,
-    log_prior: np.ndarray,
-) -> StructureEvidence:
-    """Evidence times the mean weight of each structure's draws.
-
-    Args:
-        evidence: with fixed gains.
-        before: structure of each draw, `[object, chain, draw]`.
-        after: the same at the end.
-        log_share: log of the product of mean weights, `[object, chain]`.
-        log_prior: of each structure, `[object, structure]`.
-
-    Returns:
-        The same of the filter with inferred noise. Structures without draws keep
-        their odds against all others together; their errors are not known.
-    """
-    num = evidence.probability.shape[1]
-    names = np.arange(num)
-    share = np.mean(before[..., None] == names, axis=2)
-    mass = np.mean(after[..., None] == names, axis=2)
-    # Chains start with draws of their own, which the ratio makes up for.
-    top = log_share.max(axis=1, keepdims=True)
-    mass = mass * np.exp(log_share - top)[..., None]
-    pooled = share.mean(axis=1)
-    has_draws = pooled > 0
-    factor = mass.mean(axis=1) / np.where(has_draws, pooled, 1.0)
-    residual = mass - factor[:, None] * share
-    num_chains = before.shape[1]
-    spread = np.sqrt((residual**2).sum(axis=1) / (num_chains * max(num_chains - 1, 1)))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        own = spread / np.where(has_draws, pooled, np.nan) / factor
-        whole = np.log(np.sum(evidence.probability * factor, axis=1)) - np.log(
-            np.sum(evidence.probability * has_draws, axis=1)
-        )
-        log_factor = np.where(has_draws, np.log(factor), whole[:, None]) + top
-    log_evidence = evidence.log_evidence + log_factor
-    joint = log_evidence + log_prior
-    total = np.logaddexp.reduce(joint, axis=1)
-    probability = np.exp(joint - total[:, None])
-    error = np.hypot(evidence.error, own)
-    # To first order, errors of structures independent of each other.
-    each = np.nan_to_num(probability * own)
-    rest = np.sqrt(np.sum(each**2, axis=1, keepdims=True))
-    return StructureEvidence(
-        log_evidence=log_evidence,
-        error=error,
-        probability=probability,
-        probability_error=np.sqrt(
-            evidence.probability_error**2
-            + ((1.0 - 2.0 * probability) * each**2 + probability**2 * rest**2)
-        ),
-        total=total,
-        total_error=np.hypot(evidence.total_error, rest[:, 0]),
-    )

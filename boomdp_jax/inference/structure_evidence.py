@@ -166,3 +166,63 @@ def evidence_disagrees(
 def _both(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Error of a difference; what is not known is left out."""
     return np.hypot(np.nan_to_num(first), np.nan_to_num(second))
+
+
+def reweighed(
+    evidence: StructureEvidence,
+    before: np.ndarray,
+    after: np.ndarray,
+    log_share: np.ndarray,
+    log_prior: np.ndarray,
+) -> StructureEvidence:
+    """Evidence times the mean weight of each structure's draws.
+
+    Args:
+        evidence: with fixed gains.
+        before: structure of each draw, `[object, chain, draw]`.
+        after: the same at the end.
+        log_share: log of the product of mean weights, `[object, chain]`.
+        log_prior: of each structure, `[object, structure]`.
+
+    Returns:
+        The same of the filter with inferred noise. Structures without draws keep
+        their odds against all others together; their errors are not known.
+    """
+    num = evidence.probability.shape[1]
+    names = np.arange(num)
+    share = np.mean(before[..., None] == names, axis=2)
+    mass = np.mean(after[..., None] == names, axis=2)
+    # Chains start with draws of their own, which the ratio makes up for.
+    top = log_share.max(axis=1, keepdims=True)
+    mass = mass * np.exp(log_share - top)[..., None]
+    pooled = share.mean(axis=1)
+    has_draws = pooled > 0
+    factor = mass.mean(axis=1) / np.where(has_draws, pooled, 1.0)
+    residual = mass - factor[:, None] * share
+    num_chains = before.shape[1]
+    spread = np.sqrt((residual**2).sum(axis=1) / (num_chains * max(num_chains - 1, 1)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        own = spread / np.where(has_draws, pooled, np.nan) / factor
+        whole = np.log(np.sum(evidence.probability * factor, axis=1)) - np.log(
+            np.sum(evidence.probability * has_draws, axis=1)
+        )
+        log_factor = np.where(has_draws, np.log(factor), whole[:, None]) + top
+    log_evidence = evidence.log_evidence + log_factor
+    joint = log_evidence + log_prior
+    total = np.logaddexp.reduce(joint, axis=1)
+    probability = np.exp(joint - total[:, None])
+    error = np.hypot(evidence.error, own)
+    # To first order, errors of structures independent of each other.
+    each = np.nan_to_num(probability * own)
+    rest = np.sqrt(np.sum(each**2, axis=1, keepdims=True))
+    return StructureEvidence(
+        log_evidence=log_evidence,
+        error=error,
+        probability=probability,
+        probability_error=np.sqrt(
+            evidence.probability_error**2
+            + ((1.0 - 2.0 * probability) * each**2 + probability**2 * rest**2)
+        ),
+        total=total,
+        total_error=np.hypot(evidence.total_error, rest[:, 0]),
+    )
