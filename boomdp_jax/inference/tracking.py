@@ -237,15 +237,11 @@ def track_row(
     Returns:
         The best guess after it, and the whitened innovations of its two readings.
     """
-    if state.size <= _MAX_WRITTEN_OUT:
-        channels, whitened = _track_channels(predict, split_channels(state), row, gains)
-        return join_channels(channels), jnp.stack(whitened).reshape(2, *state.shape)
 
     def correct(state, reading, mask, gain, whitening):
         error = mask * channel_difference(reading, state)
-        flat = error.reshape(-1)
-        moved = state + (gain @ flat).reshape(state.shape)
-        return moved, (whitening @ flat).reshape(state.shape)
+        moved = state + _apply(gain, error)
+        return moved, _apply(whitening, error, is_lower=True)
 
     state = jnp.where(row.is_start > 0, row.start, state)
     state, first_error = correct(
@@ -294,3 +290,16 @@ def join_channels(channels: Sequence) -> Float[Array, "1 6"]:
 def _dot(row, vector: list):
     terms = [row[i] * x for i, x in enumerate(vector)]
     return sum(terms[1:], terms[0])
+
+
+def _apply(matrix, vector: Float[Array, "body 6"], *, is_lower: bool = False):
+    """Matrix times channels, written out where there are few."""
+    flat = vector.reshape(-1)
+    num = flat.shape[0]
+    if num > _MAX_WRITTEN_OUT:
+        return (matrix @ flat).reshape(vector.shape)
+    rows = []
+    for i in range(num):
+        terms = [matrix[i, j] * flat[j] for j in range(i + 1 if is_lower else num)]
+        rows.append(sum(terms[1:], terms[0]))
+    return jnp.stack(rows).reshape(vector.shape)
