@@ -286,19 +286,26 @@ def format_report(report: dict, structures: dict[str, float], num_draws: int) ->
 
 
 def _further_laws(entries: list[dict]) -> list[str]:
-    """The best law that each block's model may lack."""
+    """The best law that each block's model may lack, and whether it does."""
     lines = []
     for entry in entries:
         for best in entry["laws"][:1]:
+            law = f"{best['body']}: {best['law'].replace('_', ' ')}"
+            factor, least = best["log_bayes_factor"], entry["threshold"]
+            if factor <= least:
+                lines.append(
+                    f"further law   none; likeliest is {law}, log Bayes factor "
+                    f"{factor:.1f}, decisive above {least:.1f}"
+                )
+                continue
             numbers = ", ".join(
                 plus_minus({"mean": mean, "sd": sd})
                 for mean, sd in zip(best["coefficient"], best["sd"], strict=True)
             )
-            name = best["law"].replace("_", " ")
-            law = f"{best['body']}: {name} {numbers} {best['unit']}".rstrip()
+            numbers = f"{numbers} {best['unit']}".rstrip()
             lines.append(
-                f"further law   {law}, log Bayes factor {best['log_bayes_factor']:.1f} "
-                f"(there above {entry['threshold']:.1f})"
+                f"further law   {law} {numbers}, log Bayes factor {factor:.1f}, "
+                f"decisive above {least:.1f}"
             )
     return lines
 

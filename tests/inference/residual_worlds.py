@@ -1,6 +1,7 @@
 """Boxes that obey some law: pushed at random, in small steps, and read with noise."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -72,12 +73,11 @@ def record_box(
     num_rows: int,
     force: Force = nothing_else,
     *,
-    noise: np.ndarray = NOISE,
     dt: np.ndarray | float = DT,
-    first: np.ndarray | None = None,
+    **options: Any,
 ) -> History:
-    """Readings of a box under random wrenches and a law."""
-    table = box_table(rng, num_rows, force, noise=noise, dt=dt, first=first)
+    """Readings of a box under random wrenches and a law; options of `box_table`."""
+    table = box_table(rng, num_rows, force, dt=dt, **options)
     state, action, next_state = (part[:, None] for part in table)
     return make_history(state, action, next_state, dt)
 

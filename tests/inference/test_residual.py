@@ -319,3 +319,4 @@ def test_inference_finds_nothing_in_a_free_box(posteriors):
     assert diagnostics["ok"]
     (entry,) = diagnostics["residual"]
     assert entry["laws"][0]["log_bayes_factor"] < entry["threshold"]
+    assert "further law   none; likeliest is box: " in posteriors["free"].summary()

@@ -1,0 +1,144 @@
+"""What a planner knows of the world: weighted hypotheses.
+
+Planners take a belief in one of three forms: a `Belief`; a pair of a pytree with a
+leading hypothesis axis and log-weights; or anything with `params` and `log_weight`,
+as a posterior has.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PyTree
+
+from boomdp_jax.core.arrays import IntScalar, Key
+
+
+class Belief(eqx.Module):
+    """Weighted hypotheses."""
+
+    hypotheses: PyTree
+    """What the model takes as its hypothesis, with a leading axis `hypothesis`."""
+    log_weight: Float[Array, " hypothesis"]
+    """Not necessarily normalised; −∞ for what is ruled out."""
+
+    @property
+    def num_hypotheses(self) -> int:
+        """Length of the axis `hypothesis`."""
+        return self.log_weight.shape[0]
+
+    @property
+    def weight(self) -> Float[Array, " hypothesis"]:
+        """Normalised to a sum of one."""
+        return jax.nn.softmax(self.log_weight)
+
+    def __getitem__(self, index: Any) -> PyTree:
+        """The hypothesis at an index, or those at several."""
+        return jax.tree.map(lambda leaf: leaf[index], self.hypotheses)
+
+
+def as_belief(belief: Any) -> Belief:
+    """Read a belief in any of its forms.
+
+    Args:
+        belief: a `Belief`, a pair `(hypotheses, log_weight)`, or an object with `params`
+            and `log_weight`.
+
+    Returns:
+        The same as a `Belief`.
+
+    Raises:
+        TypeError: none of these.
+        ValueError: no hypothesis, or another number of hypotheses than of weights.
+    """
+    if isinstance(belief, Belief):
+        hypotheses, log_weight = belief.hypotheses, belief.log_weight
+    elif hasattr(belief, "params") and hasattr(belief, "log_weight"):
+        hypotheses, log_weight = belief.params, belief.log_weight
+    elif isinstance(belief, tuple) and len(belief) == 2:
+        hypotheses, log_weight = belief
+    else:
+        raise TypeError(
+            "belief: expected a Belief, a pair (hypotheses, log_weight) or a posterior; "
+            f"got {type(belief).__name__}"
+        )
+    log_weight = jnp.asarray(log_weight, float)
+    if log_weight.ndim != 1 or not log_weight.shape[0]:
+        raise ValueError(
+            "belief: log_weight has one number for each hypothesis; got shape "
+            f"{log_weight.shape}"
+        )
+    for path, leaf in jax.tree_util.tree_leaves_with_path(hypotheses):
+        if jnp.shape(leaf)[:1] != log_weight.shape:
+            raise ValueError(
+                f"belief: leaf {jax.tree_util.keystr(path) or 'of hypotheses'} has shape "
+                f"{jnp.shape(leaf)}; expected a leading axis of {log_weight.shape[0]} "
+                "hypotheses, as many as there are weights"
+            )
+    return Belief(jax.tree.map(jnp.asarray, hypotheses), log_weight)
+
+
+def certain(hypothesis: PyTree) -> Belief:
+    """The belief of one who knows.
+
+    Args:
+        hypothesis: what is true, without the axis `hypothesis`.
+
+    Returns:
+        A belief of one hypothesis.
+    """
+    return Belief(
+        jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], hypothesis), jnp.zeros(1)
+    )
+
+
+def resample(key: Key, belief: Belief, num: int) -> Belief:
+    """As many hypotheses of equal weight, drawn systematically.
+
+    A belief with no more hypotheses than that stays as it is, with its weights.
+
+    Args:
+        key: random key.
+        belief: what to draw from.
+        num: how many to draw.
+
+    Returns:
+        Hypotheses; each occurs as often as its weight says, rounded down or up.
+    """
+    if belief.num_hypotheses <= num:
+        return belief
+    index = systematic(key, belief.weight, num)
+    return Belief(belief[index], jnp.zeros(num))
+
+
+def systematic(
+    key: Key, weight: Float[Array, " hypothesis"], num: int
+) -> Int[Array, " draw"]:
+    """Indices by one uniform number and equal steps through the cumulated weights."""
+    points = (jax.random.uniform(key) + jnp.arange(num)) / num
+    index = jnp.searchsorted(jnp.cumsum(weight), points)
+    return jnp.minimum(index, weight.shape[0] - 1)
+
+
+def most_probable(belief: Belief) -> Belief:
+    """Only the hypothesis of the largest weight."""
+    return certain(belief[jnp.argmax(belief.log_weight)])
+
+
+def mean_hypothesis(belief: Belief) -> Belief:
+    """Weighted means of all numbers; what is not a float, of the most probable one."""
+
+    def mean(leaf, best):
+        if not jnp.issubdtype(leaf.dtype, jnp.inexact):
+            return best
+        return jnp.tensordot(belief.weight.astype(leaf.dtype), leaf, axes=1)
+
+    return certain(
+        jax.tree.map(mean, belief.hypotheses, belief[jnp.argmax(belief.log_weight)])
+    )
+
+
+def draw_index(key: Key, belief: Belief) -> IntScalar:
+    """Of one hypothesis, by weight."""
+    return jax.random.categorical(key, belief.log_weight)

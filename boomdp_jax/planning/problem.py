@@ -1,0 +1,186 @@
+r"""What is planned for: a model, a reward, actions, and how time is cut.
+
+Planners know nothing of the world but these functions:
+
+- `transition_fn(key, hypothesis, state, action) -> (next_state, done)`,
+- `reward_fn(hypothesis, state, action, next_state) -> reward`,
+- `leaf_fn(hypothesis, state) -> value`, what is to be had from a state at the horizon.
+
+An action may be held for several steps, which are then one step of the plan: with
+$n$ steps of reward $r_i$ and discount $\gamma$ its reward is
+$\sum_{i<n} \gamma^i r_i$, and what follows counts by $\gamma^n$, or by nothing where
+the episode ended on the way.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from boomdp_jax.core.arrays import FloatScalar, Key
+
+TransitionFn = Callable[[Any, Any, Any, Any], tuple[Any, Any]]
+RewardFn = Callable[[Any, Any, Any, Any], Any]
+LeafFn = Callable[[Any, Any], Any]
+
+# Steps of one action that are written out rather than looped over: a loop costs some
+# microseconds a round, a long model compiled many times costs seconds.
+_LARGEST_UNROLLED = 4
+
+
+class Outcome(NamedTuple):
+    """What holding an action leads to."""
+
+    state: PyTree
+    """Where it ends."""
+    reward: FloatScalar
+    """Sum over the steps, discounted to the first."""
+    continuation: FloatScalar
+    """What the future counts by: $\\gamma^n$, 0 where the episode ended."""
+
+
+class Problem(eqx.Module):
+    """A model and what is wanted of it."""
+
+    transition_fn: TransitionFn
+    reward_fn: RewardFn
+    leaf_fn: LeafFn
+    actions: PyTree
+    """Leading axis `action`."""
+    discount: FloatScalar
+    """Of one step of the model."""
+    action_repeat: int = eqx.field(static=True)
+    """Steps of the model for which an action is held."""
+
+    @property
+    def num_actions(self) -> int:
+        """How many there are to choose from."""
+        return jax.tree.leaves(self.actions)[0].shape[0]
+
+    def action(self, index: Any) -> PyTree:
+        """The action at an index."""
+        return jax.tree.map(lambda leaf: leaf[index], self.actions)
+
+    def hold(self, key: Key, hypothesis: PyTree, state: PyTree, action: PyTree):
+        """Hold an action for `action_repeat` steps.
+
+        Args:
+            key: random key.
+            hypothesis: what the world is taken to be.
+            state: where it starts.
+            action: one action.
+
+        Returns:
+            The `Outcome`.
+        """
+
+        def one(carry, number):
+            state, reward, alive = carry
+            now = key if self.action_repeat == 1 else jax.random.fold_in(key, number)
+            moved, done = self.transition_fn(now, hypothesis, state, action)
+            gain = jnp.asarray(self.reward_fn(hypothesis, state, action, moved))
+            _check_scalar("reward_fn", gain)
+            _check_scalar("transition_fn: done", jnp.asarray(done))
+            reward = reward + jnp.where(alive > 0, alive * gain, 0.0)
+            state = jax.tree.map(
+                lambda new, old: jnp.where(alive > 0, new, old).astype(old.dtype),
+                moved,
+                state,
+            )
+            alive = jnp.where(done, 0.0, alive * self.discount)
+            return (state, reward, alive), None
+
+        dtype = self.discount.dtype
+        carry = (state, jnp.zeros((), dtype), jnp.ones((), dtype))
+        if self.action_repeat <= _LARGEST_UNROLLED:
+            for number in range(self.action_repeat):
+                carry, _ = one(carry, number)
+        else:
+            carry, _ = jax.lax.scan(one, carry, jnp.arange(self.action_repeat))
+        return Outcome(*carry)
+
+    def leaf(self, hypothesis: PyTree, state: PyTree) -> FloatScalar:
+        """Value at the horizon."""
+        value = jnp.asarray(self.leaf_fn(hypothesis, state), self.discount.dtype)
+        _check_scalar("leaf_fn", value)
+        return value
+
+
+def zero_leaf(hypothesis: PyTree, state: PyTree) -> float:
+    """Nothing is to be had beyond the horizon."""
+    del hypothesis, state
+    return 0.0
+
+
+def make_problem(
+    transition_fn: TransitionFn,
+    reward_fn: RewardFn,
+    actions: PyTree | int,
+    *,
+    leaf_fn: LeafFn | None = None,
+    discount: float | Float[Array, ""] = 1.0,
+    action_repeat: int = 1,
+) -> Problem:
+    """Check the parts that all planners share.
+
+    Args:
+        transition_fn: the model.
+        reward_fn: what a step pays.
+        actions: pytree with a leading axis `action`, or how many there are.
+        leaf_fn: value at the horizon; none: 0.
+        discount: of one step of the model, in (0, 1].
+        action_repeat: steps of the model for which an action is held.
+
+    Returns:
+        Them together.
+
+    Raises:
+        TypeError: a function is not one.
+        ValueError: no action, leaves of different numbers of actions, a count that is not
+            positive, a discount outside (0, 1].
+    """
+    for name, function in (
+        ("transition_fn", transition_fn),
+        ("reward_fn", reward_fn),
+        ("leaf_fn", leaf_fn or zero_leaf),
+    ):
+        if not callable(function):
+            raise TypeError(f"{name}: expected a function; got {function!r}")
+    if isinstance(actions, int):
+        actions = jnp.arange(actions)
+    actions = jax.tree.map(jnp.asarray, actions)
+    shapes = [leaf.shape for leaf in jax.tree.leaves(actions)]
+    counts = {shape[0] if shape else None for shape in shapes}
+    if len(counts) != 1 or not counts.isdisjoint({None, 0}):
+        raise ValueError(
+            "actions: every leaf has a leading axis `action` of the same length, at "
+            f"least 1; got shapes {shapes}"
+        )
+    check_positive("action_repeat", action_repeat)
+    if isinstance(discount, int | float) and not 0.0 < discount <= 1.0:
+        raise ValueError(f"discount: expected a number in (0, 1]; got {discount}")
+    return Problem(
+        transition_fn,
+        reward_fn,
+        leaf_fn or zero_leaf,
+        actions,
+        jnp.asarray(discount, float),
+        action_repeat,
+    )
+
+
+def check_positive(name: str, count: Any) -> None:
+    """Raise unless a static count is a positive integer."""
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise ValueError(f"{name}: expected a positive integer; got {count!r}")
+
+
+def _check_scalar(name: str, value: Array) -> None:
+    if value.ndim:
+        raise ValueError(
+            f"{name}: expected one number for one state and action; got shape "
+            f"{value.shape}"
+        )
