@@ -4,5 +4,6 @@ from boomdp_jax.planning.belief import Belief as Belief
 from boomdp_jax.planning.belief import certain as certain
 from boomdp_jax.planning.plan import Plan as Plan
 from boomdp_jax.planning.plan import SearchInfo as SearchInfo
+from boomdp_jax.planning.sparse_sampling import sparse_sampling as sparse_sampling
 
-__all__ = ["Belief", "Plan", "SearchInfo", "certain"]
+__all__ = ["Belief", "Plan", "SearchInfo", "certain", "sparse_sampling"]

@@ -42,8 +42,8 @@ def as_belief(belief: Any) -> Belief:
     """Read a belief in any of its forms.
 
     Args:
-        belief: a `Belief`, a pair `(hypotheses, log_weight)`, or an object with `params`
-            and `log_weight`.
+        belief: a `Belief`, a pair `(hypotheses, log_weight)`, or an object with
+            `params` and `log_weight`.
 
     Returns:
         The same as a `Belief`.
@@ -60,8 +60,8 @@ def as_belief(belief: Any) -> Belief:
         hypotheses, log_weight = belief
     else:
         raise TypeError(
-            "belief: expected a Belief, a pair (hypotheses, log_weight) or a posterior; "
-            f"got {type(belief).__name__}"
+            "belief: expected a Belief, a pair (hypotheses, log_weight) or a "
+            f"posterior; got {type(belief).__name__}"
         )
     log_weight = jnp.asarray(log_weight, float)
     if log_weight.ndim != 1 or not log_weight.shape[0]:
@@ -71,10 +71,10 @@ def as_belief(belief: Any) -> Belief:
         )
     for path, leaf in jax.tree_util.tree_leaves_with_path(hypotheses):
         if jnp.shape(leaf)[:1] != log_weight.shape:
+            name = jax.tree_util.keystr(path) or "of hypotheses"
             raise ValueError(
-                f"belief: leaf {jax.tree_util.keystr(path) or 'of hypotheses'} has shape "
-                f"{jnp.shape(leaf)}; expected a leading axis of {log_weight.shape[0]} "
-                "hypotheses, as many as there are weights"
+                f"belief: leaf {name} has shape {jnp.shape(leaf)}; expected a leading "
+                f"axis of {log_weight.shape[0]} hypotheses, as many as weights"
             )
     return Belief(jax.tree.map(jnp.asarray, hypotheses), log_weight)
 

@@ -26,11 +26,6 @@ TransitionFn = Callable[[Any, Any, Any, Any], tuple[Any, Any]]
 RewardFn = Callable[[Any, Any, Any, Any], Any]
 LeafFn = Callable[[Any, Any], Any]
 
-# Steps of one action that are written out rather than looped over: a loop costs some
-# microseconds a round, a long model compiled many times costs seconds.
-_LARGEST_UNROLLED = 4
-
-
 class Outcome(NamedTuple):
     """What holding an action leads to."""
 
@@ -95,11 +90,9 @@ class Problem(eqx.Module):
 
         dtype = self.discount.dtype
         carry = (state, jnp.zeros((), dtype), jnp.ones((), dtype))
-        if self.action_repeat <= _LARGEST_UNROLLED:
-            for number in range(self.action_repeat):
-                carry, _ = one(carry, number)
-        else:
-            carry, _ = jax.lax.scan(one, carry, jnp.arange(self.action_repeat))
+        if self.action_repeat == 1:
+            return Outcome(*one(carry, 0)[0])
+        carry, _ = jax.lax.scan(one, carry, jnp.arange(self.action_repeat))
         return Outcome(*carry)
 
     def leaf(self, hypothesis: PyTree, state: PyTree) -> FloatScalar:
@@ -139,8 +132,8 @@ def make_problem(
 
     Raises:
         TypeError: a function is not one.
-        ValueError: no action, leaves of different numbers of actions, a count that is not
-            positive, a discount outside (0, 1].
+        ValueError: no action, leaves of different numbers of actions, a count that is
+            not positive, a discount outside (0, 1].
     """
     for name, function in (
         ("transition_fn", transition_fn),
