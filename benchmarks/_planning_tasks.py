@@ -20,9 +20,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.ndimage import distance_transform_edt
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
 
 from boomdp_jax.physics import State, step
 from boomdp_jax.physics.scene_file import load_scene
@@ -77,7 +81,7 @@ def pendulum() -> Task:
     spec = scene_of(
         {
             "gravity": [0.0, -9.81],
-            "dt": 0.02,
+            "dt": 0.04,
             "bodies": [
                 {
                     "name": "bob",
@@ -104,9 +108,7 @@ def pendulum() -> Task:
 
     def transition(key, hypothesis, state, action):
         wrench = jnp.zeros((1, 3)).at[0, :2].set(action)
-        # Two steps of 20 ms are one of the model.
-        for _ in range(2):
-            state, _ = step(spec.scene, hypothesis, state, wrench)
+        state, _ = step(spec.scene, hypothesis, state, wrench)
         return state, False
 
     def from_upright(state):
@@ -214,9 +216,6 @@ def _is_inside(place, walls):
 
 def flood_filled(walls, goal, *, low, high, margin=0.0, spacing=0.1):
     """Length of the way to a goal, from a table of a grid's shortest ways."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import dijkstra
-
     counts = np.round((high - low) / spacing).astype(int) + 1
     x = low[0] + spacing * np.arange(counts[0])
     y = low[1] + spacing * np.arange(counts[1])
@@ -245,8 +244,6 @@ def flood_filled(walls, goal, *, low, high, margin=0.0, spacing=0.1):
     far = dijkstra(graph.tocsr(), directed=False, indices=at).reshape(blocked.shape)
     # In a wall's margin: a little more than at the nearest free place.
     finite = np.isfinite(far)
-    from scipy.ndimage import distance_transform_edt
-
     away, nearest = distance_transform_edt(~finite, return_indices=True)
     far = far[tuple(nearest)] + spacing * away
     table = jnp.asarray(far, jnp.float32)
@@ -272,11 +269,11 @@ ROOM = np.array(
         [6.34, -1.0, 7.4, 5.8],
         [-1.0, -1.0, 7.4, 0.06],
         [-1.0, 4.74, 7.4, 5.8],
-        [3.13, 0.0, 3.26, 2.88],
-        [3.13, 4.32, 3.26, 4.79],
-        [0.0, 2.37, 0.64, 2.43],
-        [2.56, 2.37, 3.84, 2.43],
-        [5.76, 2.37, 6.4, 2.43],
+        [3.1, 0.0, 3.3, 2.88],
+        [3.1, 4.32, 3.3, 4.79],
+        [0.0, 2.3, 0.64, 2.5],
+        [2.56, 2.3, 3.84, 2.5],
+        [5.76, 2.3, 6.4, 2.5],
     ]
 )
 CART_GOAL = np.array([5.28, 1.38])
@@ -304,7 +301,6 @@ def cart() -> Task:
                     "a": "cart",
                     "pose": [-AXLE, 0.0, 0.0],
                     "viscous": [30.0, 600.0],
-                    "dry": [0.0, 0.0],
                 }
             ],
         }
@@ -314,11 +310,14 @@ def cart() -> Task:
 
     def transition(key, hypothesis, state, action):
         wrench = jnp.zeros((1, 3)).at[0, :2].set(action)
-        for _ in range(PUSH_STEPS):
+
+        def one(_, state):
             moved, _ = step(spec.scene, hypothesis, state, wrench)
             hits = touches_room(moved.pose[0])
             pose = jnp.where(hits, state.pose, moved.pose)
-            state = State(pose, jnp.where(hits, 0.0, moved.twist))
+            return State(pose, jnp.where(hits, 0.0, moved.twist))
+
+        state = jax.lax.fori_loop(0, PUSH_STEPS, one, state)
         return state, _distance(state.pose[0, :2], CART_GOAL) < NEAR_GOAL
 
     def start(key):
@@ -382,16 +381,10 @@ def axle_hypotheses(num: int, seed: int):
     params = task.hypothesis
 
     def moved(place):
-        pose = params.wheel.pose.at[..., 0].set(place)
-        return _with_wheel_pose(params, pose)
+        position = params.wheel.position.at[..., 0].set(place)
+        return eqx.tree_at(lambda p: p.wheel.position, params, position)
 
     return jax.vmap(moved)(jnp.asarray(where, jnp.float32))
-
-
-def _with_wheel_pose(params, pose):
-    import equinox as eqx
-
-    return eqx.tree_at(lambda p: p.wheel.pose, params, pose)
 
 
 # --- Acrobot --------------------------------------------------------------------------

@@ -21,6 +21,7 @@ class Options(eqx.Module):
     common_random_numbers: bool = eqx.field(static=True)
     capacity: int = eqx.field(static=True)
     overflow: str = eqx.field(static=True)
+    verify: bool = eqx.field(static=True)
     keep_tree: bool = eqx.field(static=True)
 
 
@@ -49,6 +50,7 @@ def check_options(
     overflow: str,
     likelihood_fn: Any,
     cell_size: Any,
+    verify: bool,
 ) -> None:
     """Options that are names, and what goes with what."""
     check_positive("depth", depth)
@@ -64,6 +66,11 @@ def check_options(
     if isinstance(cell_size, str) and cell_size != "auto":
         raise ValueError(
             f"cell_size: expected sizes, 'auto' or None; got {cell_size!r}"
+        )
+    if verify and hypotheses in ("fresh", "adaptive"):
+        raise ValueError(
+            "verify: plans are followed under one hypothesis each; expected hypotheses "
+            f"'root', 'map' or 'mean', got {hypotheses!r}"
         )
     if hypotheses == "adaptive":
         if likelihood_fn is None:

@@ -26,6 +26,7 @@ TransitionFn = Callable[[Any, Any, Any, Any], tuple[Any, Any]]
 RewardFn = Callable[[Any, Any, Any, Any], Any]
 LeafFn = Callable[[Any, Any], Any]
 
+
 class Outcome(NamedTuple):
     """What holding an action leads to."""
 

@@ -13,6 +13,8 @@ from jaxtyping import Array, Float
 
 RISK_MEASURES = ("mean", "cvar", "worst")
 
+_TRIFLE = 1e-4
+
 
 def combine(
     values: Float[Array, "hypothesis action"],
@@ -49,8 +51,9 @@ def without_unknown(
     """Actions of unknown value get the worst that is known under their hypothesis.
 
     All that follows them was dropped; −∞ would veto them under every other hypothesis.
+    They get a trifle less, so that where one action alone is known it is chosen.
     """
     is_known = values > -jnp.inf
     worst = jnp.min(jnp.where(is_known, values, jnp.inf), axis=-1, keepdims=True)
     worst = jnp.where(jnp.isfinite(worst), worst, 0.0)
-    return jnp.where(is_known, values, worst)
+    return jnp.where(is_known, values, worst - _TRIFLE * (1.0 + jnp.abs(worst)))

@@ -47,7 +47,7 @@ from boomdp_jax.planning.problem import (
     check_positive,
     make_problem,
 )
-from boomdp_jax.planning.replay import with_previous
+from boomdp_jax.planning.replay import verified_values, with_previous
 from boomdp_jax.planning.risk import combine, without_unknown
 from boomdp_jax.planning.tree import (
     Grid,
@@ -90,6 +90,7 @@ def sparse_sampling(
     coordinates_fn: CoordinatesFn | None = None,
     overflow: str = "stratified",
     stratum_size: Any = None,
+    verify: bool = False,
     previous: Plan | None = None,
     keep_tree: bool = False,
 ) -> Plan:
@@ -134,6 +135,9 @@ def sparse_sampling(
         overflow: which cells are kept where they are more: `"stratified"`, `"bound"`,
             `"gumbel"`, `"random"` or `"first"`.
         stratum_size: of the coarser cells of `"stratified"`; default: four cells.
+        verify: whether to follow the best plan that begins with each action from the
+            state itself, and compare those returns instead of the tree's values, which
+            merging blurs. For models without noise; not for `"fresh"`, `"adaptive"`.
         previous: plan of the decision before, if its first action was carried out for
             `action_repeat` steps: the rest of it is tried again, and counts where it is
             better than what the tree found.
@@ -154,6 +158,7 @@ def sparse_sampling(
         overflow=overflow,
         likelihood_fn=likelihood_fn,
         cell_size=cell_size,
+        verify=verify,
     )
     check_positive("num_hypotheses", num_hypotheses)
     check_positive("capacity", capacity)
@@ -173,6 +178,7 @@ def sparse_sampling(
         common_random_numbers=common_random_numbers,
         capacity=capacity,
         overflow=overflow,
+        verify=verify,
         keep_tree=keep_tree,
     )
     is_auto = isinstance(cell_size, str)
@@ -223,7 +229,7 @@ def _search(
     # The tree's own key is the caller's, so that its random numbers are those of the
     # recursion; the others are apart from it by numbers that no level has.
     roots = _roots(jax.random.fold_in(key, 0x7FFFFFFF), belief, options)
-    num_calls = 0
+    num_calls, action_repeat = 0, problem.action_repeat
     if is_auto:
         cell_size = cell_size_from_steps(
             jax.random.fold_in(key, 0x7FFFFFFE),
@@ -233,9 +239,7 @@ def _search(
             state,
             len(options.num_samples),
         )
-        num_calls += num_calls_for_cell_size(
-            len(options.num_samples), problem.action_repeat
-        )
+        num_calls += num_calls_for_cell_size(len(options.num_samples), action_repeat)
     grid = _grid(state, cell_size, stratum_size, coordinates_fn, options)
     num_calls += _calls_of_trees(problem, options, roots.num_hypotheses, grid)
 
@@ -256,14 +260,18 @@ def _search(
     else:
         tree = _trees(key, problem, roots, belief, state, grid, options)
         values = jax.vmap(root_values)(tree)[:, 0]
+    follow_key = jax.random.fold_in(key, 0x7FFFFFFD)
+    num_followed = roots.num_hypotheses * len(options.num_samples) * action_repeat
+    if options.verify:
+        values = verified_values(follow_key, problem, roots, state, tree)
+        num_calls += num_followed * problem.num_actions
     values = without_unknown(values)
-    weight = roots.weight
     if previous is not None:
         values = with_previous(key, problem, roots, state, values, previous)
         num_calls += (
             roots.num_hypotheses * len(options.num_samples) * (problem.action_repeat)
         )
-    q_values = combine(values, weight, measure=options.risk, level=risk_level)
+    q_values = combine(values, roots.weight, measure=options.risk, level=risk_level)
     index = jnp.argmax(q_values)
     return Plan(
         index=index,
