@@ -34,16 +34,17 @@ def plan_of_indices(
     mean = rollouts.mean(returns)
     best = jnp.argmax(mean)
     is_first = indices[:, 0][:, None] == jnp.arange(num_actions)[None]
-    value = jnp.where(is_first, mean[:, None], -jnp.inf)
-    of_best = returns[jnp.argmax(value, axis=0)]
+    # A return of −∞ still comes before none.
+    finite = jnp.maximum(mean, jnp.finfo(mean.dtype).min)
+    best_of = jnp.argmax(jnp.where(is_first, finite[:, None], -jnp.inf), axis=0)
     is_tried = jnp.any(is_first, axis=0)
     sequence = rollouts.problem.action(indices[best])
     return Plan(
         index=indices[best, 0],
         action=jax.tree.map(lambda leaf: leaf[0], sequence),
         value=mean[best],
-        q_values=jnp.max(value, axis=0),
-        hypothesis_q_values=jnp.where(is_tried[:, None], of_best, -jnp.inf).T,
+        q_values=jnp.where(is_tried, mean[best_of], -jnp.inf),
+        hypothesis_q_values=jnp.where(is_tried[:, None], returns[best_of], -jnp.inf).T,
         sequence=sequence,
         info=SearchInfo(rollouts.num_calls(num_candidates)),
     )

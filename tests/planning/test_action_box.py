@@ -41,8 +41,8 @@ def test_actions_that_span_no_box_are_refused(actions):
 def test_nearest_measures_each_number_by_its_range():
     listed = jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1000.0]])
     problem = make_problem(move_in_table, table_reward, listed)
-    # 400 is less far on the second axis, of range 1000, than 0.6 is on the first.
-    assert nearest(problem, jnp.array([0.6, 0.0])) == 1
+    # 600 is farther from 0 than from 1000, but 0.1 of one range less far than 0.9.
+    assert nearest(problem, jnp.array([0.9, 600.0])) == 1
     assert nearest(problem, jnp.array([0.4, 0.0])) == 0
     assert nearest(problem, jnp.array([0.6, 900.0])) == 2
 

@@ -137,6 +137,34 @@ def test_action_that_is_good_under_all_hypotheses_beats_the_favourite_of_each(
     assert plan.index == 1
 
 
+def pay_for_every_step(hypothesis, state, action, next_state):
+    """A little less for the last action, at the root."""
+    del hypothesis, next_state
+    return -1.0 + 0.1 * (state == 0) * (action == 3)
+
+
+def count_steps(key, hypothesis, state, action):
+    del key, hypothesis, action
+    return state + 1, False
+
+
+def test_action_that_few_simulations_reached_does_not_win_on_an_early_value(mctx):
+    # With a leaf of zero where costs lie ahead, the less looked at the better.
+    plan = plan_in_table(
+        certain(jnp.ones(2)),
+        0,
+        transition_fn=count_steps,
+        reward_fn=pay_for_every_step,
+        leaf_fn=None,
+        actions=4,
+        depth=8,
+        discount=1.0,
+        num_simulations=64,
+    )
+    assert plan.index == 3
+    assert plan.value == plan.q_values[3] < jnp.max(plan.q_values)
+
+
 def test_library_is_not_loaded_before_it_is_used():
     module = importlib.import_module("boomdp_jax.planning.mctx_search")
     assert "mctx" not in vars(module)

@@ -112,8 +112,10 @@ def test_actions_stay_in_the_box():
 
 
 def test_returns_that_are_not_numbers_leave_the_start_as_it_is():
-    plan = tilted(np.array([1.0, np.nan]), num_samples=256)
-    np.testing.assert_array_equal(plan.sequence, np.zeros((2, 2)))
+    first = tilted(np.array([0.6, -0.6]), num_samples=256)
+    plan = tilted(np.array([1.0, np.nan]), num_samples=256, previous=first)
+    expected = jnp.concatenate([first.sequence[1:], first.sequence[-1:]])
+    np.testing.assert_allclose(plan.sequence, expected, atol=1e-12)
     assert plan.value == -np.inf
 
 

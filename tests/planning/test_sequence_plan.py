@@ -25,20 +25,20 @@ def listed_plan():
     belief = Belief(jnp.ones((2, 2)), jnp.log(jnp.array([3.0, 1.0])))
     rollouts = draw_rollouts(jax.random.key(0), problem, belief, jnp.asarray(0), 2, 2)
     indices = jnp.array([[0, 1], [2, 0], [0, 2], [2, 2]])
-    returns = jnp.array([[4.0, 0.0], [1.0, 1.0], [0.0, 20.0], [0.0, 0.0]])
+    returns = jnp.array([[4.0, 0.0], [-jnp.inf, 1.0], [0.0, 20.0], [-jnp.inf, 1.0]])
     return problem, eqx.filter_jit(plan_of_indices)(rollouts, indices, returns)
 
 
 def test_best_sequence_is_planned_and_each_action_valued_by_its_best(listed_plan):
     _, plan = listed_plan
-    # Means of the returns: 3, 1, 5, 0.
+    # Means of the returns: 3, −∞, 5, −∞; the second action is not tried.
     assert plan.index == 0
     assert plan.value == 5.0
     assert plan.action["push"] == 10.0
     np.testing.assert_array_equal(plan.sequence["push"], [10.0, 12.0])
-    np.testing.assert_array_equal(plan.q_values, [5.0, -np.inf, 1.0])
+    np.testing.assert_array_equal(plan.q_values, [5.0, -np.inf, -np.inf])
     np.testing.assert_array_equal(
-        plan.hypothesis_q_values, [[0.0, -np.inf, 1.0], [20.0, -np.inf, 1.0]]
+        plan.hypothesis_q_values, [[0.0, -np.inf, -np.inf], [20.0, -np.inf, 1.0]]
     )
     assert plan.info.num_model_calls == 4 * 2 * 2
 
