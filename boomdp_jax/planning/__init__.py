@@ -2,8 +2,28 @@
 
 from boomdp_jax.planning.belief import Belief as Belief
 from boomdp_jax.planning.belief import certain as certain
+from boomdp_jax.planning.cross_entropy import (
+    cross_entropy_method as cross_entropy_method,
+)
+from boomdp_jax.planning.gradient_shooting import gradient_shooting as gradient_shooting
+from boomdp_jax.planning.leaf import rollout_leaf as rollout_leaf
+from boomdp_jax.planning.mctx_search import mctx_search as mctx_search
+from boomdp_jax.planning.mppi import mppi as mppi
 from boomdp_jax.planning.plan import Plan as Plan
 from boomdp_jax.planning.plan import SearchInfo as SearchInfo
+from boomdp_jax.planning.random_shooting import random_shooting as random_shooting
 from boomdp_jax.planning.sparse_sampling import sparse_sampling as sparse_sampling
 
-__all__ = ["Belief", "Plan", "SearchInfo", "certain", "sparse_sampling"]
+__all__ = [
+    "Belief",
+    "Plan",
+    "SearchInfo",
+    "certain",
+    "cross_entropy_method",
+    "gradient_shooting",
+    "mctx_search",
+    "mppi",
+    "random_shooting",
+    "rollout_leaf",
+    "sparse_sampling",
+]
