@@ -2,7 +2,20 @@
 
 from boomdp_jax.planning.belief import Belief as Belief
 from boomdp_jax.planning.belief import certain as certain
+from boomdp_jax.planning.forward_search import (
+    ForwardSearchReport as ForwardSearchReport,
+)
+from boomdp_jax.planning.forward_search import (
+    forward_search_sparse_sampling as forward_search_sparse_sampling,
+)
 from boomdp_jax.planning.plan import Plan as Plan
 from boomdp_jax.planning.plan import SearchInfo as SearchInfo
 
-__all__ = ["Belief", "Plan", "SearchInfo", "certain"]
+__all__ = [
+    "Belief",
+    "ForwardSearchReport",
+    "Plan",
+    "SearchInfo",
+    "certain",
+    "forward_search_sparse_sampling",
+]

@@ -2,10 +2,11 @@
 
 The numbers of `hold` and `leaf` come from the problem itself, everything else is plain
 Python. Random keys: a transition out of the node with path number $p$ at level $d$ has
-the key `fold_in(fold_in(key, d), p C + c)` for the draw $c$ of $C$, whatever the action;
-or, where actions do not share their random numbers, `fold_in(fold_in(key, d),
-(p C + c) A + a)`. The root is node 0 of level 0; draw $c$ of action $a$ leads from node
-$p$ to node $p A C + a C + c$ of the next level, modulo $2^{32}$.
+the key `fold_in(fold_in(key, d), p C + c)` for the draw $c$ of $C$, whatever the
+action; or, where actions do not share their random numbers,
+`fold_in(fold_in(key, d), (p C + c) A + a)`. The root is node 0 of level 0; draw $c$ of
+action $a$ leads from node $p$ to node $p A C + a C + c$ of the next level, modulo
+$2^{32}$.
 """
 
 from collections.abc import Sequence
