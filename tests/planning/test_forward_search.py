@@ -74,7 +74,7 @@ def whole_tree(world, state, key=KEY, is_shared=True, **options):
 @pytest.mark.parametrize("is_shared", [True, False])
 def test_decision_and_value_are_the_whole_trees(is_shared):
     num_expansions = []
-    for seed in range(6):
+    for seed in range(6 if is_shared else 3):
         world = table(seed)
         found = plan(KEY, certain(world), seed, common_random_numbers=is_shared)
         expected = whole_tree(world, seed, is_shared=is_shared)
@@ -102,7 +102,7 @@ def test_bounds_hold_whenever_the_budget_is_spent():
     world = table(3)
     expected = whole_tree(world, 2)
     widths = []
-    for max_expansions in (1, 2, 4, 8, 16):
+    for max_expansions in (1, 4, 16):
         found = plan(KEY, certain(world), 2, max_expansions=max_expansions)
         assert np.all(found.tree.lower <= expected + 1e-12)
         assert np.all(found.tree.upper >= expected - 1e-12)
@@ -135,10 +135,10 @@ def test_a_decision_takes_less_than_its_value():
 
 
 def test_hypotheses_are_averaged_by_weight():
-    weight = np.array([0.5, 0.2, 0.3])
+    weight = np.array([0.6, 0.4])
     for state in range(4):
-        found = plan(KEY, belief_of((0, 1, 2), np.log(weight) + 3.0), state)
-        values = np.stack([whole_tree(table(seed), state) for seed in range(3)])
+        found = plan(KEY, belief_of((0, 1), np.log(weight) + 3.0), state)
+        values = np.stack([whole_tree(table(seed), state) for seed in range(2)])
         average = weight @ values
         assert found.tree.is_exact
         np.testing.assert_allclose(found.value, average.max(), rtol=1e-12)
@@ -161,7 +161,7 @@ def test_a_hypothesis_that_is_ruled_out_has_no_say():
 
 def test_a_large_belief_is_thinned():
     belief = belief_of(range(6), np.zeros(6))
-    found = plan(KEY, belief, 0, num_hypotheses=4)
+    found = jax.eval_shape(lambda: plan(KEY, belief, 0, num_hypotheses=4))
     assert found.hypothesis_q_values.shape == (4, NUM_ACTIONS)
 
 
@@ -263,14 +263,16 @@ def test_counts_are_those_of_a_tree_that_is_visited_whole():
 
 
 def test_batch_and_jit_give_what_single_calls_give():
-    belief = belief_of((0, 1), np.zeros(2))
+    one = partial(plan, KEY, belief_of((0, 1), np.zeros(2)))
     states = jnp.arange(NUM_STATES)
-    one = partial(plan, KEY, belief, max_expansions=12)
     single = jax.tree.map(lambda *x: jnp.stack(x), *map(one, states))
-    for several in (jax.vmap(one)(states), jax.jit(jax.vmap(one))(states)):
-        jax.tree.map(
-            partial(np.testing.assert_allclose, rtol=1e-12, atol=1e-12), several, single
-        )
+    close = partial(np.testing.assert_allclose, rtol=1e-12, atol=1e-12)
+    jax.tree.map(close, jax.jit(jax.vmap(one))(states), single)
+    jax.tree.map(
+        close,
+        jax.vmap(lambda key: plan(key, certain(table(0)), 0))(KEY[None]),
+        jax.tree.map(lambda leaf: leaf[None], plan(KEY, certain(table(0)), 0)),
+    )
 
 
 def test_single_precision_gives_the_same_decision(precision):
