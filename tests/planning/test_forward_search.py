@@ -102,7 +102,7 @@ def test_bounds_hold_whenever_the_budget_is_spent():
     world = table(3)
     expected = whole_tree(world, 2)
     widths = []
-    for max_expansions in (1, 4, 16):
+    for max_expansions in (3, 16):
         found = plan(KEY, certain(world), 2, max_expansions=max_expansions)
         assert np.all(found.tree.lower <= expected + 1e-12)
         assert np.all(found.tree.upper >= expected - 1e-12)
@@ -110,7 +110,7 @@ def test_bounds_hold_whenever_the_budget_is_spent():
         middle = 0.5 * (found.tree.lower + found.tree.upper)
         np.testing.assert_allclose(found.q_values, middle)
         widths.append(float((found.tree.upper - found.tree.lower).sum()))
-        if max_expansions <= 4:
+        if max_expansions == 3:
             assert not found.tree.is_solved
             assert not found.tree.is_exact
             assert found.tree.num_expansions[0] == max_expansions
@@ -266,12 +266,10 @@ def test_batch_and_jit_give_what_single_calls_give():
     one = partial(plan, KEY, belief_of((0, 1), np.zeros(2)))
     states = jnp.arange(NUM_STATES)
     single = jax.tree.map(lambda *x: jnp.stack(x), *map(one, states))
-    close = partial(np.testing.assert_allclose, rtol=1e-12, atol=1e-12)
-    jax.tree.map(close, jax.jit(jax.vmap(one))(states), single)
+    assert len(np.unique(single.tree.num_expansions)) > 2
+    several = jax.jit(jax.vmap(one))(states)
     jax.tree.map(
-        close,
-        jax.vmap(lambda key: plan(key, certain(table(0)), 0))(KEY[None]),
-        jax.tree.map(lambda leaf: leaf[None], plan(KEY, certain(table(0)), 0)),
+        partial(np.testing.assert_allclose, rtol=1e-12, atol=1e-12), several, single
     )
 
 
