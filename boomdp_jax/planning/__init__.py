@@ -1,9 +1,17 @@
 """Search over any state: what to do now, given a model, a reward and a belief."""
 
+from boomdp_jax.planning.a_star import PathReport as PathReport
+from boomdp_jax.planning.a_star import a_star as a_star
 from boomdp_jax.planning.belief import Belief as Belief
 from boomdp_jax.planning.belief import certain as certain
 from boomdp_jax.planning.cross_entropy import (
     cross_entropy_method as cross_entropy_method,
+)
+from boomdp_jax.planning.forward_search import (
+    ForwardSearchReport as ForwardSearchReport,
+)
+from boomdp_jax.planning.forward_search import (
+    forward_search_sparse_sampling as forward_search_sparse_sampling,
 )
 from boomdp_jax.planning.gradient_shooting import gradient_shooting as gradient_shooting
 from boomdp_jax.planning.leaf import rollout_leaf as rollout_leaf
@@ -16,10 +24,14 @@ from boomdp_jax.planning.sparse_sampling import sparse_sampling as sparse_sampli
 
 __all__ = [
     "Belief",
+    "ForwardSearchReport",
+    "PathReport",
     "Plan",
     "SearchInfo",
+    "a_star",
     "certain",
     "cross_entropy_method",
+    "forward_search_sparse_sampling",
     "gradient_shooting",
     "mctx_search",
     "mppi",

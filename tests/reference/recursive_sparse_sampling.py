@@ -2,15 +2,17 @@
 
 The numbers of `hold` and `leaf` come from the problem itself, everything else is plain
 Python. Random keys: a transition out of the node with path number $p$ at level $d$ has
-the key `fold_in(fold_in(key, d), p C + c)` for the draw $c$ of $C$, whatever the action;
-or, where actions do not share their random numbers, `fold_in(fold_in(key, d),
-(p C + c) A + a)`. The root is node 0 of level 0; draw $c$ of action $a$ leads from node
-$p$ to node $p A C + a C + c$ of the next level, modulo $2^{32}$.
+the key `fold_in(fold_in(key, d), p C + c)` for the draw $c$ of $C$, whatever the
+action; or, where actions do not share their random numbers,
+`fold_in(fold_in(key, d), (p C + c) A + a)`. The root is node 0 of level 0; draw $c$ of
+action $a$ leads from node $p$ to node $p A C + a C + c$ of the next level, modulo
+$2^{32}$.
 """
 
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -43,19 +45,12 @@ def recursive_values(
     widths = [num_samples] * depth if isinstance(num_samples, int) else num_samples
     assert len(widths) == depth
     num_actions = problem.num_actions
-
-    @jax.jit
-    def hold(level, number, action, state):
-        level_key = jax.random.fold_in(key, level)
-        transition_key = jax.random.fold_in(level_key, number)
-        return problem.hold(transition_key, hypothesis, state, problem.action(action))
-
-    @jax.jit
-    def leaf(state):
-        return problem.leaf(hypothesis, state)
+    actions = [problem.action(action) for action in range(num_actions)]
 
     def value(level, path, state):
-        return leaf(state) if level == depth else q_values(level, path, state).max()
+        if level == depth:
+            return _leaf(problem, hypothesis, state)
+        return q_values(level, path, state).max()
 
     def q_values(level, path, state):
         width = widths[level]
@@ -65,7 +60,8 @@ def recursive_values(
                 number = path * width + sample
                 if not common_random_numbers:
                     number = number * num_actions + action
-                outcome = hold(level, np.uint32(number % 2**32), action, state)
+                place = np.array([level, number % 2**32], np.uint32)
+                outcome = _hold(key, place, problem, hypothesis, state, actions[action])
                 values[action, sample] = outcome.reward
                 if outcome.continuation > 0:
                     child = path * num_actions * width + action * width + sample
@@ -74,3 +70,15 @@ def recursive_values(
         return values.mean(axis=1)
 
     return q_values(0, 0, jax.tree.map(np.asarray, state))
+
+
+@eqx.filter_jit
+def _hold(key, place, problem, hypothesis, state, action):
+    level_key = jax.random.fold_in(key, place[0])
+    transition_key = jax.random.fold_in(level_key, place[1])
+    return problem.hold(transition_key, hypothesis, state, action)
+
+
+@eqx.filter_jit
+def _leaf(problem, hypothesis, state):
+    return problem.leaf(hypothesis, state)
