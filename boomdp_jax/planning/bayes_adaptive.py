@@ -26,7 +26,7 @@ from boomdp_jax.planning.belief import Belief
 from boomdp_jax.planning.expansion import expand, root_nodes, sample_of_hypothesis
 from boomdp_jax.planning.problem import Problem
 from boomdp_jax.planning.risk import without_unknown
-from boomdp_jax.planning.tree import Grid, Tree, grow, root_values
+from boomdp_jax.planning.tree import Merging, Tree, grow, root_values
 
 LikelihoodFn = Callable[[Any, Any, Any, Any], Any]
 """`(hypothesis, state, action, next_state)` to the log-density of seeing that state at
@@ -48,7 +48,7 @@ def adaptive_values(
     belief: Belief,
     state: PyTree,
     num_samples: tuple[int, ...],
-    grid: Grid,
+    merging: Merging,
     likelihood_fn: LikelihoodFn,
     *,
     common_random_numbers: bool,
@@ -61,7 +61,7 @@ def adaptive_values(
         belief: hypotheses that are told apart.
         state: the root.
         num_samples: draws of each action by level; at least two levels.
-        grid: what is merged below.
+        merging: which states below are one.
         likelihood_fn: how well a hypothesis explains what is seen.
         common_random_numbers: whether actions are tried under the same luck.
 
@@ -109,7 +109,7 @@ def adaptive_values(
             sample_of_hypothesis(problem, hypothesis),
             flat.nodes.state,
             num_samples[1:],
-            grid,
+            merging,
             common_random_numbers=common_random_numbers,
             first_level=1,
         )

@@ -11,13 +11,10 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, UInt32
+from jaxtyping import Array, Int
 
 from boomdp_jax.core.arrays import BoolScalar, IntScalar
-
-# Odd numbers whose bits are well mixed: powers of the first tell channels apart, the
-# other two spread neighbouring cells over the table.
-_CHANNEL, _FIRST, _SECOND = 0x9E3779B1, 0x85EBCA6B, 0xC2B2AE35
+from boomdp_jax.planning.grid import hash_of
 
 
 class Slot(NamedTuple):
@@ -56,7 +53,9 @@ class CellTable(eqx.Module):
             first that may.
         """
         probes = jnp.arange(self.num_probes, dtype=jnp.uint32)
-        slots = ((_hash(cell) + probes) % np.uint32(self.size)).astype(jnp.int32)
+        slots = ((hash_of(cell[None])[0] + probes) % np.uint32(self.size)).astype(
+            jnp.int32
+        )
         nodes = self.node[slots]
         is_match = (nodes >= 0) & jnp.all(cells[nodes] == cell[None], axis=1)
         is_known, is_empty = jnp.any(is_match), nodes < 0
@@ -75,12 +74,3 @@ class CellTable(eqx.Module):
 def empty_table(size: int, num_probes: int) -> CellTable:
     """A table of so many slots, all empty."""
     return CellTable(jnp.full(size, -1, jnp.int32), min(num_probes, size))
-
-
-def _hash(cell: Int[Array, " channel"]) -> UInt32[Array, ""]:
-    factors = [pow(_CHANNEL, power + 1, 2**32) for power in range(cell.shape[0])]
-    products = cell.astype(jnp.uint32) * np.array(factors, np.uint32)
-    mixed = jnp.sum(products, dtype=jnp.uint32)
-    for factor, shift in ((_FIRST, 16), (_SECOND, 13), (1, 16)):
-        mixed = (mixed ^ (mixed >> np.uint32(shift))) * np.uint32(factor)
-    return mixed

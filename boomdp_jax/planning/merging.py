@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from boomdp_jax.core.arrays import IntScalar, Key
-from boomdp_jax.planning.cells import hash_of
+from boomdp_jax.planning.grid import hash_of
 
 OVERFLOW_POLICIES = ("stratified", "bound", "gumbel", "random", "first")
 

@@ -24,19 +24,16 @@ from boomdp_jax.planning.belief import (
     most_probable,
     resample,
 )
-from boomdp_jax.planning.cells import (
-    CoordinatesFn,
-    all_numbers,
+from boomdp_jax.planning.cell_size import (
     cell_size_from_steps,
-    check_size,
     num_calls_for_cell_size,
-    size_of_each,
 )
 from boomdp_jax.planning.expansion import (
     Sample,
     sample_of_belief,
     sample_of_hypothesis,
 )
+from boomdp_jax.planning.grid import CoordinatesFn, all_numbers, make_grid
 from boomdp_jax.planning.options import Options, check_options, draws_by_level
 from boomdp_jax.planning.plan import Plan, SearchInfo
 from boomdp_jax.planning.problem import (
@@ -50,7 +47,7 @@ from boomdp_jax.planning.problem import (
 from boomdp_jax.planning.replay import verified_values, with_previous
 from boomdp_jax.planning.risk import combine, without_unknown
 from boomdp_jax.planning.tree import (
-    Grid,
+    Merging,
     Tree,
     best_sequence,
     counts,
@@ -182,32 +179,38 @@ def sparse_sampling(
         keep_tree=keep_tree,
     )
     is_auto = isinstance(cell_size, str)
-    sizes = None if is_auto else _size("cell_size", cell_size)
-    stratum = _size("stratum_size", stratum_size)
+    state = jax.tree.map(jnp.asarray, state)
+    merging = None
+    if cell_size is not None and not is_auto:
+        merging = _merging(coordinates_fn, cell_size, stratum_size, state, options)
     sequence = None if previous is None else previous.sequence
     return _search(
         key,
         as_belief(belief),
-        jax.tree.map(jnp.asarray, state),
+        state,
         problem,
         options,
-        is_auto,
-        sizes,
-        stratum,
-        coordinates_fn or all_numbers,
+        merging,
+        (coordinates_fn or all_numbers, stratum_size) if is_auto else None,
         likelihood_fn,
         jnp.asarray(risk_level, float),
         sequence,
     )
 
 
-def _size(name: str, size: Any) -> Float[Array, "..."] | None:
-    """A size of cells as an array, checked."""
-    if size is None:
-        return None
-    size = jnp.asarray(size, float)
-    check_size(name, size)
-    return size
+def _merging(
+    coordinates_fn: CoordinatesFn | None,
+    cell_size: Any,
+    stratum_size: Any,
+    state: PyTree,
+    options: Options,
+) -> Merging:
+    """Cells and strata, checked against the state."""
+    grid = make_grid(coordinates_fn, cell_size, state)
+    if stratum_size is None:
+        stratum_size = _STRATUM * grid.cell_size
+    strata = make_grid(grid.coordinates_fn, stratum_size, state, name="stratum_size")
+    return Merging(grid, strata, options.capacity, options.overflow)
 
 
 @eqx.filter_jit
@@ -217,10 +220,8 @@ def _search(
     state: PyTree,
     problem: Problem,
     options: Options,
-    is_auto: bool,
-    cell_size: Float[Array, "..."] | None,
-    stratum_size: Float[Array, "..."] | None,
-    coordinates_fn: CoordinatesFn,
+    merging: Merging | None,
+    auto: tuple[CoordinatesFn, Any] | None,
     likelihood_fn: LikelihoodFn | None,
     risk_level: Float[Array, ""],
     previous: PyTree | None,
@@ -230,35 +231,35 @@ def _search(
     # recursion; the others are apart from it by numbers that no level has.
     roots = _roots(jax.random.fold_in(key, 0x7FFFFFFF), belief, options)
     num_calls, action_repeat = 0, problem.action_repeat
-    if is_auto:
+    if auto is not None:
         cell_size = cell_size_from_steps(
             jax.random.fold_in(key, 0x7FFFFFFE),
             problem,
             sample_of_belief(problem, belief),
-            coordinates_fn,
+            auto[0],
             state,
             len(options.num_samples),
         )
         num_calls += num_calls_for_cell_size(len(options.num_samples), action_repeat)
-    grid = _grid(state, cell_size, stratum_size, coordinates_fn, options)
-    num_calls += _calls_of_trees(problem, options, roots.num_hypotheses, grid)
+        merging = _merging(auto[0], cell_size, auto[1], state, options)
+    num_calls += _calls_of_trees(problem, options, roots.num_hypotheses, merging)
 
     if options.hypotheses == "adaptive":
         assert likelihood_fn is not None
-        assert grid is not None
+        assert merging is not None
         found = adaptive_values(
             key,
             problem,
             roots,
             state,
             options.num_samples,
-            grid,
+            merging,
             likelihood_fn,
             common_random_numbers=options.common_random_numbers,
         )
         values, tree = found.q_values, found.tree
     else:
-        tree = _trees(key, problem, roots, belief, state, grid, options)
+        tree = _trees(key, problem, roots, belief, state, merging, options)
         values = jax.vmap(root_values)(tree)[:, 0]
     follow_key = jax.random.fold_in(key, 0x7FFFFFFD)
     num_followed = roots.num_hypotheses * len(options.num_samples) * action_repeat
@@ -280,7 +281,7 @@ def _search(
         q_values=q_values,
         hypothesis_q_values=values,
         sequence=_sequence(problem, tree, roots, index, options),
-        info=_info(tree, num_calls, grid),
+        info=_info(tree, num_calls, merging),
         tree=tree if options.keep_tree else None,
     )
 
@@ -295,35 +296,13 @@ def _roots(key: Key, belief: Belief, options: Options) -> Belief:
     return resample(key, belief, options.num_hypotheses)
 
 
-def _grid(
-    state: PyTree,
-    cell_size: Array | None,
-    stratum_size: Array | None,
-    coordinates_fn: CoordinatesFn,
-    options: Options,
-) -> Grid | None:
-    """Sizes checked against a state's coordinates."""
-    if cell_size is None:
-        return None
-    shape = jax.eval_shape(coordinates_fn, state).shape
-    if len(shape) != 1:
-        raise ValueError(f"coordinates_fn: expected one vector; got shape {shape}")
-    cell_size = size_of_each("cell_size", cell_size, shape[0])
-    if stratum_size is None:
-        stratum_size = _STRATUM * cell_size
-    stratum_size = size_of_each("stratum_size", stratum_size, shape[0])
-    return Grid(
-        coordinates_fn, cell_size, stratum_size, options.capacity, options.overflow
-    )
-
-
 def _trees(
     key: Key,
     problem: Problem,
     roots: Belief,
     belief: Belief,
     state: PyTree,
-    grid: Grid | None,
+    merging: Merging | None,
     options: Options,
 ) -> Tree:
     """One tree for each hypothesis, all with the same random numbers."""
@@ -336,7 +315,7 @@ def _trees(
             sample,
             states,
             options.num_samples,
-            grid,
+            merging,
             common_random_numbers=options.common_random_numbers,
             keep_nodes=options.keep_tree,
         )
@@ -348,16 +327,16 @@ def _trees(
 
 
 def _calls_of_trees(
-    problem: Problem, options: Options, num_roots: int, grid: Grid | None
+    problem: Problem, options: Options, num_roots: int, merging: Merging | None
 ) -> int:
     """Calls of the model in all trees."""
     draws, num_actions = options.num_samples, problem.num_actions
     if options.hypotheses == "adaptive":
         num_outcomes = num_roots * num_actions * draws[0]
-        below = level_shapes(num_outcomes, num_actions, draws[1:], grid)
+        below = level_shapes(num_outcomes, num_actions, draws[1:], merging)
         first = num_actions * draws[0] * problem.action_repeat
         return num_roots * (first + num_model_calls(below, problem))
-    shapes = level_shapes(1, num_actions, draws, grid)
+    shapes = level_shapes(1, num_actions, draws, merging)
     leaves = shapes[-1].num_nodes * num_actions * draws[-1]
     if leaves > _MOST_LEAVES:
         raise ValueError(
@@ -384,12 +363,12 @@ def _sequence(
     return problem.action(jnp.concatenate([index[None], rest]))
 
 
-def _info(tree: Tree, num_calls: int, grid: Grid | None) -> SearchInfo:
+def _info(tree: Tree, num_calls: int, merging: Merging | None) -> SearchInfo:
     num_nodes, num_merged, num_dropped = jax.vmap(counts)(tree)
     return SearchInfo(
         jnp.asarray(num_calls),
         num_nodes,
         num_merged,
         num_dropped,
-        None if grid is None else grid.cell_size,
+        None if merging is None else merging.grid.cell_size,
     )

@@ -23,19 +23,18 @@ from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
 from boomdp_jax.core.arrays import IntScalar, Key
-from boomdp_jax.planning.cells import CoordinatesFn, cells_of
 from boomdp_jax.planning.expansion import Children, Nodes, Sample, expand, root_nodes
+from boomdp_jax.planning.grid import Grid
 from boomdp_jax.planning.merging import merge
 from boomdp_jax.planning.problem import Problem
 
 
-class Grid(eqx.Module):
+class Merging(eqx.Module):
     """When states are the same, and how many of a level are kept."""
 
-    coordinates_fn: CoordinatesFn
-    cell_size: Float[Array, " channel"]
-    stratum_size: Float[Array, " channel"]
-    """Of the coarser grid of the policy `"stratified"`."""
+    grid: Grid
+    strata: Grid
+    """Coarser cells, of the policy `"stratified"`."""
     capacity: int = eqx.field(static=True)
     """Places at each level."""
     policy: str = eqx.field(static=True)
@@ -82,7 +81,10 @@ class Tree(NamedTuple):
 
 
 def level_shapes(
-    num_roots: int, num_actions: int, num_samples: tuple[int, ...], grid: Grid | None
+    num_roots: int,
+    num_actions: int,
+    num_samples: tuple[int, ...],
+    merging: Merging | None,
 ) -> list[Shape]:
     """Shapes of all levels; the children of the root are never merged.
 
@@ -92,10 +94,10 @@ def level_shapes(
     for level, draws in enumerate(num_samples):
         num_children = num_nodes * num_actions * draws
         is_last = level == len(num_samples) - 1
-        is_merged = grid is not None and (level > 0 or num_roots > 1) and not is_last
+        is_merged = merging is not None and (level > 0 or num_roots > 1) and not is_last
         num_below = 0 if is_last else num_children
-        if grid is not None and is_merged:
-            num_below = min(num_children, grid.capacity)
+        if merging is not None and is_merged:
+            num_below = min(num_children, merging.capacity)
         shapes.append(Shape(num_nodes, draws, num_below, is_merged))
         num_nodes = num_below
     return shapes
@@ -124,7 +126,7 @@ def grow(
     sample: Sample,
     states: PyTree,
     num_samples: tuple[int, ...],
-    grid: Grid | None,
+    merging: Merging | None,
     *,
     common_random_numbers: bool = True,
     first_level: int = 0,
@@ -138,7 +140,7 @@ def grow(
         sample: the model.
         states: leading axis `node`; usually one.
         num_samples: draws of each action, by level.
-        grid: what is merged; None: nothing.
+        merging: which states are one; None: none.
         common_random_numbers: whether actions are tried under the same luck.
         first_level: number of the states' level, of which the random keys are made.
         keep_nodes: whether the records have the states of the levels.
@@ -147,7 +149,7 @@ def grow(
         The tree; values of the given states are `root_values` of it.
     """
     shapes = level_shapes(
-        jax.tree.leaves(states)[0].shape[0], problem.num_actions, num_samples, grid
+        jax.tree.leaves(states)[0].shape[0], problem.num_actions, num_samples, merging
     )
     nodes = root_nodes(states, problem.discount.dtype)
     held_discount = problem.discount**problem.action_repeat
@@ -167,7 +169,7 @@ def grow(
         score = children.nodes.path_return
         score = score + level_discount * held_discount * children.leaf
         merge_key = jax.random.fold_in(expansion_key, 0)
-        below, place, counts = _next_level(merge_key, shape, children, score, grid)
+        below, place, counts = _next_level(merge_key, shape, children, score, merging)
         axes = (shape.num_nodes, problem.num_actions, shape.num_samples)
         reward, continuation = children.reward, children.continuation
         if below is None:
@@ -200,25 +202,24 @@ def grow(
 
 
 def _next_level(
-    key: Key, shape: Shape, children: Children, score: Array, grid: Grid | None
+    key: Key, shape: Shape, children: Children, score: Array, merging: Merging | None
 ):
     """Nodes of the next level, each child's place there, and how many had none."""
     exists = children.nodes.exists
     none = jnp.zeros((), int)
     if not shape.num_below:
         return None, jnp.full(exists.shape, -1), (none, none)
-    if not shape.is_merged or grid is None:
+    if not shape.is_merged or merging is None:
         place = jnp.where(exists, jnp.arange(exists.shape[0]), -1)
         return children.nodes, place, (none, none)
-    coordinates = jax.vmap(grid.coordinates_fn)(children.nodes.state)
     merged = merge(
         key,
-        cells_of(coordinates, grid.cell_size),
-        cells_of(coordinates, grid.stratum_size),
+        jax.vmap(merging.grid.cell)(children.nodes.state),
+        jax.vmap(merging.strata.cell)(children.nodes.state),
         score,
         exists,
         capacity=shape.num_below,
-        policy=grid.policy,
+        policy=merging.policy,
     )
     nodes = jax.tree.map(lambda leaf: leaf[merged.child], children.nodes)
     nodes = nodes._replace(exists=merged.exists)

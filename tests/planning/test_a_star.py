@@ -213,8 +213,9 @@ def test_a_point_goes_round_a_wall_to_where_the_likelier_gap_is():
         assert np.sign(heights[np.argmax(np.abs(heights))]) == (1, -1)[likelier]
         np.testing.assert_allclose(found.value, -0.3 * found.tree.plan_length)
         # Through the gap it is 3.5 at least, on eight directions a twelfth more, and
-        # either end is up to a step away from where it should be.
-        assert -4.4 < found.value < -3.4
+        # either end and the turn in the gap are up to a step away from where they
+        # should be.
+        assert -4.7 < found.value < -3.4
         # The rest of the sequence repeats the last action.
         np.testing.assert_array_equal(
             found.sequence[found.tree.plan_length :],
@@ -223,7 +224,7 @@ def test_a_point_goes_round_a_wall_to_where_the_likelier_gap_is():
 
 
 @pytest.mark.parametrize(
-    ("table_size", "max_probes", "overflows"), [(50, 3, True), (131, 131, False)]
+    ("table_size", "max_probes", "overflows"), [(100, 3, True), (131, 131, False)]
 )
 def test_a_crowded_table_changes_no_path(table_size, max_probes, overflows):
     cost = maze(4)

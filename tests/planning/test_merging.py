@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from boomdp_jax.planning.cells import hash_of
+from boomdp_jax.planning.grid import hash_of
 from boomdp_jax.planning.merging import OVERFLOW_POLICIES, merge
 
 

@@ -285,7 +285,7 @@ def test_adaptive_root_is_the_other_where_nothing_is_seen():
         ({"risk": "var"}, "risk: expected one of"),
         ({"risk_level": 0.0}, "risk_level"),
         ({"cell_size": "half"}, "cell_size: expected sizes, 'auto' or None"),
-        ({"cell_size": [1.0, 2.0]}, "cell_size: expected one number, or one for each"),
+        ({"cell_size": [1.0, 2.0]}, "cell_size: expected one number or 1"),
         ({"cell_size": 0.0}, "cell_size: expected positive"),
         ({"capacity": 0}, "capacity"),
         ({"discount": 0.0}, "discount"),
@@ -300,7 +300,7 @@ def test_adaptive_root_is_the_other_where_nothing_is_seen():
         ),
         (
             {"cell_size": 1.0, "coordinates_fn": lambda s: s},
-            "coordinates_fn: expected one vector",
+            "coordinates_fn: expected a vector",
         ),
     ],
 )
