@@ -18,6 +18,7 @@ import _repository  # noqa: F401
 import jax
 import jax.numpy as jnp
 import numpy as np
+from _planning_crates import crates
 from _planning_rivals import HAS_MCTX, rivals
 from _planning_tasks import TASKS, Task, axle_hypotheses
 from _report import Reporter, parser_of
@@ -376,8 +377,6 @@ def report_overflow(reporter: Reporter, arguments) -> None:
 def report_learning(reporter: Reporter, arguments) -> None:
     """Two crates look alike; one is bolted down, and a nudge tells which."""
     del arguments
-    from _planning_crates import crates
-
     for row in crates():
         reporter.report(**row)
 
