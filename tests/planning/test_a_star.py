@@ -185,6 +185,15 @@ def test_a_small_budget_leads_to_the_nearest_known_state():
     assert total == -7
 
 
+def test_of_equally_near_states_the_cheapest_to_reach_is_gone_to():
+    cost = np.random.default_rng(3).uniform(1.0, 2.0, (SIZE, SIZE))
+    found = plan(KEY, certain(cost), np.array([5, 5]), max_expansions=7)
+    around = cost[tuple((np.array([5, 5]) + MOVES).T)]
+    assert found.tree.plan_length == 1
+    assert found.index == around.argmin()
+    np.testing.assert_allclose(found.value, -around.min(), rtol=1e-12)
+
+
 def walk(key, wall, state, action):
     """A step of 0.3 in a direction, not through a wall at x = 1 but for its gap."""
     target = state + 0.3 * jnp.stack([jnp.cos(action), jnp.sin(action)])

@@ -173,6 +173,18 @@ def test_wrong_bounds_are_noticed():
         assert found.tree.num_contradictions[0] > 0
 
 
+@pytest.mark.parametrize("shift", [-1.5, 1.5])
+def test_bounds_of_one_sign_allow_for_the_end_of_an_episode(shift):
+    bounds = (shift - 1.0, shift + 1.0)
+    for seed in range(6):
+        world = table(seed)
+        world["reward"] = world["reward"] + shift
+        found = plan(KEY, certain(world), seed, value_bounds=bounds)
+        expected = whole_tree(world, seed)
+        assert found.tree.num_contradictions[0] == 0
+        np.testing.assert_allclose(found.value, expected.max(), rtol=1e-12)
+
+
 def test_bounds_by_functions_save_expansions():
     class Close:
         def lower(self, world, state, num_left):
