@@ -6,10 +6,10 @@ the end of it; a nudge costs 0.1 and moves a light crate by some millimetres; wa
 costs 0.05. Light and stuck are as likely. The crate's place is read after each action,
 and the belief follows by Bayes' rule, for all planners alike.
 
-Whoever has not begun to go round in the end has to. By hand: who nudges first pays 0.1,
-and then 0 or 2: 1.1 on average. Going round at once costs 2, shoving at once 0 or 3 + 2:
-2.5 on average. Who plans as if all were known from the next step on waits, for that is
-cheaper than a nudge, for as long as it may.
+Whoever has not begun to go round in the end has to. By hand: who nudges first pays
+0.1, and then 0 or 2: 1.1 on average. Going round at once costs 2, shoving at once 0 or
+3 + 2: 2.5 on average. Who plans as if all were known from the next step on waits, for
+that is cheaper than a nudge, for as long as it may.
 """
 
 import equinox as eqx

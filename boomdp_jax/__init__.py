@@ -28,6 +28,7 @@ _LAZY = {
     "infer_batch": "boomdp_jax.inference",
     "infer_sweep": "boomdp_jax.inference",
     "load_posterior": "boomdp_jax.inference",
+    "sparse_sampling": "boomdp_jax.planning",
 }
 
 __all__ = [
@@ -47,6 +48,7 @@ __all__ = [
     "load_scene",
     "rollout",
     "save_history",
+    "sparse_sampling",
     "step",
 ]
 

@@ -13,6 +13,7 @@ from boomdp_jax.planning import Belief, a_star, certain
 from boomdp_jax.planning.cell_table import empty_table
 
 KEY = jax.random.key(0)
+TRACES = []
 SIZE = 11
 MOVES = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
 
@@ -27,6 +28,7 @@ def maze(seed):
 
 
 def move(key, cost, state, action):
+    TRACES.append(0)
     target = jnp.clip(state + action, 0, SIZE - 1)
     target = jnp.where(jnp.isinf(cost[target[0], target[1]]), state, target)
     return target, jnp.all(target == SIZE - 1)
@@ -65,7 +67,7 @@ def earned(cost, sequence, length):
     return total, place
 
 
-plan = partial(
+traced = partial(
     a_star,
     transition_fn=move,
     reward_fn=pay,
@@ -74,6 +76,13 @@ plan = partial(
     max_expansions=400,
     max_plan_length=60,
 )
+
+
+def plan(*arguments, **options):
+    """A plan in arrays of NumPy."""
+    return jax.device_get(traced(*arguments, **options))
+
+
 in_maze = partial(plan, leaf_fn=distance)
 START = np.zeros(2, int)
 
@@ -131,7 +140,7 @@ GRAPH = {
     "cost": np.array([[1.0, 3.0], [1.0, 1.0], [5.0, 5.0], [0.0, 0.0]]),
 }
 in_graph = partial(
-    a_star,
+    plan,
     transition_fn=lambda key, graph, state, action: (
         graph["next"][state, action].astype(state.dtype),
         graph["next"][state, action] == 3,
@@ -176,6 +185,15 @@ def test_a_small_budget_leads_to_the_nearest_known_state():
     assert total == -7
 
 
+def test_of_equally_near_states_the_cheapest_to_reach_is_gone_to():
+    cost = np.random.default_rng(3).uniform(1.0, 2.0, (SIZE, SIZE))
+    found = plan(KEY, certain(cost), np.array([5, 5]), max_expansions=7)
+    around = cost[tuple((np.array([5, 5]) + MOVES).T)]
+    assert found.tree.plan_length == 1
+    assert found.index == around.argmin()
+    np.testing.assert_allclose(found.value, -around.min(), rtol=1e-12)
+
+
 def walk(key, wall, state, action):
     """A step of 0.3 in a direction, not through a wall at x = 1 but for its gap."""
     target = state + 0.3 * jnp.stack([jnp.cos(action), jnp.sin(action)])
@@ -190,7 +208,7 @@ def test_a_point_goes_round_a_wall_to_where_the_likelier_gap_is():
     walls = {"gap": jnp.array([2.0, -2.0]), "goal": jnp.asarray(np.stack([goal, goal]))}
     angles = jnp.linspace(0.0, 2.0 * jnp.pi, 8, endpoint=False)
     steps = partial(
-        a_star,
+        plan,
         KEY,
         transition_fn=walk,
         reward_fn=lambda wall, state, action, target: -0.3,
@@ -205,7 +223,7 @@ def test_a_point_goes_round_a_wall_to_where_the_likelier_gap_is():
         wall = {"gap": walls["gap"][likelier], "goal": goal}
         place, heights = jnp.zeros(2), []
         for number, action in enumerate(found.sequence[: found.tree.plan_length]):
-            place, done = walk(KEY, wall, place, action)
+            place, done = jax.jit(walk)(KEY, wall, place, action)
             heights.append(float(place[1]))
             assert done == (number == found.tree.plan_length - 1)
         assert found.tree.is_best
@@ -249,20 +267,24 @@ def test_a_crowded_table_changes_no_path(table_size, max_probes, overflows):
 
 def test_a_full_table_still_tells_all_its_cells_apart():
     generator = np.random.default_rng(2)
-    cells = jnp.asarray(generator.permutation(64)[:, None] * np.array([[1, -7, 1000]]))
-    cells = cells.astype(jnp.int32)
+    cells = generator.permutation(64)[:, None] * np.array([[1, -7, 1000]])
+    cells = jnp.asarray(cells.astype(np.int32))
 
     def put(table, node):
         slot = table.find(cells, cells[node])
         return table.put(slot.index, node, jnp.array(True)), slot.node
 
-    table, before = jax.lax.scan(
-        put, empty_table(64, 64), jnp.arange(64, dtype="int32")
-    )
+    @jax.jit
+    def fill_and_find():
+        nodes = jnp.arange(64, dtype=jnp.int32)
+        table, before = jax.lax.scan(put, empty_table(64, 64), nodes)
+        unknown = table.find(cells, jnp.array([1, 1, 1], jnp.int32))
+        after = jax.vmap(lambda cell: table.find(cells, cell))(cells)
+        return before, after, unknown
+
+    before, after, unknown = fill_and_find()
     np.testing.assert_array_equal(before, -1)
-    after = jax.vmap(lambda cell: table.find(cells, cell))(cells)
     np.testing.assert_array_equal(after.node, np.arange(64))
-    unknown = table.find(cells, jnp.array([1, 1, 1], jnp.int32))
     assert unknown.node == -1
     assert unknown.is_taken
     assert not np.any(after.is_taken)
@@ -270,7 +292,7 @@ def test_a_full_table_still_tells_all_its_cells_apart():
 
 def test_held_actions_and_discount_enter_the_value():
     line = partial(
-        a_star,
+        plan,
         KEY,
         certain(jnp.zeros(())),
         transition_fn=lambda key, _, state, action: (
@@ -296,10 +318,13 @@ def test_held_actions_and_discount_enter_the_value():
 
 def test_a_limit_of_depth_is_kept():
     cost = np.ones((SIZE, SIZE))
-    for depth, is_found in ((2 * SIZE - 3, False), (2 * SIZE - 2, True)):
-        found = in_maze(KEY, certain(cost), START, depth=depth)
-        assert found.tree.is_found == is_found
-        assert found.tree.plan_length <= depth
+    limited = partial(in_maze, KEY, certain(cost), depth=2 * SIZE - 3)
+    far, near = limited(START), limited(START + np.array([0, 1]))
+    assert not far.tree.is_found
+    assert far.tree.plan_length <= 2 * SIZE - 3
+    assert far.tree.num_expansions < 400
+    assert near.tree.is_best
+    assert near.tree.plan_length == 2 * SIZE - 3
 
 
 def test_a_path_longer_than_the_sequence_is_cut_off():
@@ -311,23 +336,33 @@ def test_a_path_longer_than_the_sequence_is_cut_off():
 
 
 def test_forbidden_steps_are_not_taken():
-    cost = np.ones((SIZE, SIZE))
+    def reward(world, state, action, target):
+        return jnp.where(world["is_forbidden"][target[0], target[1]], -jnp.inf, -1.0)
 
-    def reward(cost, state, action, target):
-        forbidden = (target[0] == 5) & (target[1] != 8)
-        return jnp.where(forbidden, -jnp.inf, -1.0)
-
-    found = in_maze(KEY, certain(cost), START, reward_fn=reward)
+    cautious = partial(
+        plan,
+        KEY,
+        transition_fn=lambda key, world, *rest: move(key, world["cost"], *rest),
+        reward_fn=reward,
+        leaf_fn=steps_left,
+    )
+    world = {
+        "cost": np.ones((SIZE, SIZE)),
+        "is_forbidden": np.zeros((SIZE, SIZE), bool),
+    }
+    world["is_forbidden"][5] = np.arange(SIZE) != 8
+    found = cautious(certain(world), START)
     places = np.cumsum(found.sequence[: found.tree.plan_length], axis=0)
     assert found.tree.is_best
     assert [5, 8] in places.tolist()
     assert found.value == -2.0 * (SIZE - 1)
 
-    stuck = in_maze(KEY, certain(cost), START, reward_fn=lambda *arguments: -jnp.inf)
+    world["is_forbidden"] = np.ones((SIZE, SIZE), bool)
+    stuck = cautious(certain(world), START)
     assert not stuck.tree.is_found
     assert stuck.tree.plan_length == 0
     assert stuck.tree.num_expansions == 1
-    assert stuck.value == distance(cost, START)
+    assert stuck.value == steps_left(None, START)
 
 
 def test_far_too_large_cells_still_yield_an_action():
@@ -365,9 +400,10 @@ def test_coordinates_may_leave_out_part_of_the_state():
 def test_batch_and_jit_give_what_single_calls_give():
     cost = maze(4)
     free = np.argwhere(np.isfinite(cost))[::9]
-    one = partial(in_maze, KEY, certain(cost))
-    single = jax.tree.map(lambda *x: jnp.stack(x), *map(one, free))
+    single = [in_maze(KEY, certain(cost), state) for state in free]
+    single = jax.tree.map(lambda *x: np.stack(x), *single)
     assert len(np.unique(single.tree.num_expansions)) > 3
+    one = partial(traced, KEY, certain(cost), leaf_fn=distance)
     several = jax.jit(jax.vmap(one))(free)
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-12), several, single)
 
@@ -382,18 +418,13 @@ def test_single_precision_finds_the_same_path(precision):
 
 
 def test_arrays_and_numbers_of_the_world_do_not_compile_anew():
-    traces = []
-
-    def counted(key, cost, state, action):
-        traces.append(0)
-        return move(key, cost, state, action)
-
+    in_maze(KEY, certain(maze(0)), START)
+    TRACES.clear()
     for seed in range(3):
-        options = {"transition_fn": counted, "cell_size": 0.5 + 0.1 * seed}
-        in_maze(KEY, certain(maze(seed)), START + seed, **options)
-        if not seed:
-            first = len(traces)
-    assert len(traces) == first
+        in_maze(KEY, certain(maze(seed)), START + seed, cell_size=0.5 + 0.1 * seed)
+    assert not TRACES
+    in_maze(KEY, certain(maze(0)), START, max_probes=5)
+    assert TRACES
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from tests.reference.recursive_sparse_sampling import recursive_values
 NUM_STATES, NUM_ACTIONS, DEPTH, NUM_SAMPLES = 7, 3, 3, 2
 NUM_NODES = sum((NUM_ACTIONS * NUM_SAMPLES) ** level for level in range(DEPTH))
 KEY = jax.random.key(5)
+TRACES = []
 
 
 def table(seed):
@@ -23,14 +24,15 @@ def table(seed):
     probability = generator.dirichlet(np.full(NUM_STATES, 0.4), size=shape)
     reward = generator.uniform(-1.0, 1.0, (*shape, NUM_STATES))
     return {
-        "log_probability": jnp.log(jnp.asarray(probability) + 1e-12),
-        "reward": jnp.asarray(reward),
-        "is_terminal": jnp.asarray(generator.random(NUM_STATES) < 0.25),
+        "cumulative": np.cumsum(probability, axis=-1)[..., :-1],
+        "reward": reward,
+        "is_terminal": generator.random(NUM_STATES) < 0.25,
     }
 
 
 def transition(key, world, state, action):
-    following = jax.random.categorical(key, world["log_probability"][state, action])
+    TRACES.append(0)
+    following = jnp.sum(jax.random.uniform(key) > world["cumulative"][state, action])
     return following, world["is_terminal"][following]
 
 
@@ -43,7 +45,7 @@ def leaf(world, state):
 
 
 def belief_of(seeds, log_weight):
-    worlds = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(table, seeds))
+    worlds = jax.tree.map(lambda *leaves: np.stack(leaves), *map(table, seeds))
     return Belief(worlds, jnp.asarray(log_weight, float))
 
 
@@ -53,13 +55,18 @@ SETTING = {
     "actions": NUM_ACTIONS,
     "discount": 0.9,
 }
-plan = partial(
+traced = partial(
     forward_search_sparse_sampling,
     **SETTING,
     depth=DEPTH,
     num_samples=NUM_SAMPLES,
     value_bounds=(-1.0, 1.0),
 )
+
+
+def plan(*arguments, **options):
+    """A plan in arrays of NumPy."""
+    return jax.device_get(traced(*arguments, **options))
 
 
 def whole_tree(world, state, key=KEY, is_shared=True, **options):
@@ -88,34 +95,21 @@ def test_decision_and_value_are_the_whole_trees(is_shared):
     assert np.mean(num_expansions) < 0.7 * NUM_NODES
 
 
-def test_leaf_values_and_held_actions_enter_as_in_the_whole_tree():
-    options = {"leaf_fn": leaf, "action_repeat": 2}
-    for seed in range(3):
-        world = table(seed)
-        found = plan(KEY, certain(world), seed, leaf_bounds=(-1.0, 1.0), **options)
-        expected = whole_tree(world, seed, **options)
-        np.testing.assert_allclose(found.value, expected.max(), rtol=1e-12)
-        np.testing.assert_allclose(found.value, expected[found.index], rtol=1e-12)
-
-
 def test_bounds_hold_whenever_the_budget_is_spent():
     world = table(3)
-    expected = whole_tree(world, 2)
-    widths = []
-    for max_expansions in (3, 16):
-        found = plan(KEY, certain(world), 2, max_expansions=max_expansions)
-        assert np.all(found.tree.lower <= expected + 1e-12)
-        assert np.all(found.tree.upper >= expected - 1e-12)
-        assert found.tree.num_expansions[0] <= max_expansions
-        middle = 0.5 * (found.tree.lower + found.tree.upper)
-        np.testing.assert_allclose(found.q_values, middle)
-        widths.append(float((found.tree.upper - found.tree.lower).sum()))
-        if max_expansions == 3:
-            assert not found.tree.is_solved
-            assert not found.tree.is_exact
-            assert found.tree.num_expansions[0] == max_expansions
-    assert np.all(np.diff(widths) <= 1e-12)
-    assert widths[-1] < widths[0]
+    for state in range(4):
+        expected = whole_tree(world, state)
+        short = plan(KEY, certain(world), state, max_expansions=3)
+        long = plan(KEY, certain(world), state)
+        for found in (short, long):
+            assert np.all(found.tree.lower <= expected + 1e-12)
+            assert np.all(found.tree.upper >= expected - 1e-12)
+            middle = 0.5 * (found.tree.lower + found.tree.upper)
+            np.testing.assert_allclose(found.q_values, middle)
+        assert not short.tree.is_solved
+        assert not short.tree.is_exact
+        assert short.tree.num_expansions[0] == 3
+        assert np.all(short.tree.lower < short.tree.upper)
 
 
 def test_a_decision_takes_less_than_its_value():
@@ -134,34 +128,40 @@ def test_a_decision_takes_less_than_its_value():
     assert counts[:, 0].sum() < counts[:, 1].sum()
 
 
-def test_hypotheses_are_averaged_by_weight():
+HELD = {"leaf_fn": leaf, "action_repeat": 2}
+plan_held = partial(plan, leaf_bounds=(-1.0, 1.0), **HELD)
+
+
+def test_hypotheses_are_averaged_by_weight_with_leaf_values_and_held_actions():
     weight = np.array([0.6, 0.4])
     for state in range(4):
-        found = plan(KEY, belief_of((0, 1), np.log(weight) + 3.0), state)
-        values = np.stack([whole_tree(table(seed), state) for seed in range(2)])
+        found = plan_held(KEY, belief_of((0, 1), np.log(weight) + 3.0), state)
+        values = np.stack([whole_tree(table(seed), state, **HELD) for seed in range(2)])
         average = weight @ values
         assert found.tree.is_exact
         np.testing.assert_allclose(found.value, average.max(), rtol=1e-12)
-        chosen = values[:, found.index]
         np.testing.assert_allclose(
-            found.hypothesis_q_values[:, found.index], chosen, rtol=1e-12
+            found.hypothesis_q_values[:, found.index],
+            values[:, found.index],
+            rtol=1e-12,
         )
         assert np.all(found.tree.num_expansions < NUM_NODES)
+        assert np.all(found.tree.num_contradictions == 0)
 
 
 def test_a_hypothesis_that_is_ruled_out_has_no_say():
-    broken = jax.tree.map(lambda leaf: leaf, table(1))
-    broken["reward"] = jnp.full_like(broken["reward"], jnp.nan)
-    worlds = jax.tree.map(lambda *leaves: jnp.stack(leaves), table(0), broken)
-    found = plan(KEY, Belief(worlds, jnp.array([0.0, -jnp.inf])), 1)
-    alone = plan(KEY, certain(table(0)), 1)
+    broken = table(1)
+    broken["reward"] = np.full_like(broken["reward"], np.nan)
+    worlds = jax.tree.map(lambda *leaves: np.stack(leaves), table(0), broken)
+    found = plan_held(KEY, (worlds, np.array([0.0, -np.inf])), 1)
     assert found.tree.is_exact
-    np.testing.assert_allclose(found.value, alone.value, rtol=1e-12)
+    expected = whole_tree(table(0), 1, **HELD)
+    np.testing.assert_allclose(found.value, expected.max(), rtol=1e-12)
 
 
 def test_a_large_belief_is_thinned():
     belief = belief_of(range(6), np.zeros(6))
-    found = jax.eval_shape(lambda: plan(KEY, belief, 0, num_hypotheses=4))
+    found = jax.eval_shape(lambda: traced(KEY, belief, 0, num_hypotheses=4))
     assert found.hypothesis_q_values.shape == (4, NUM_ACTIONS)
 
 
@@ -171,6 +171,18 @@ def test_wrong_bounds_are_noticed():
     for bounds in ((-1.0, -0.2), (0.2, 1.0)):
         found = plan(KEY, certain(world), 0, value_bounds=bounds)
         assert found.tree.num_contradictions[0] > 0
+
+
+@pytest.mark.parametrize("shift", [-1.5, 1.5])
+def test_bounds_of_one_sign_allow_for_the_end_of_an_episode(shift):
+    bounds = (shift - 1.0, shift + 1.0)
+    for seed in range(6):
+        world = table(seed)
+        world["reward"] = world["reward"] + shift
+        found = plan(KEY, certain(world), seed, value_bounds=bounds)
+        expected = whole_tree(world, seed)
+        assert found.tree.num_contradictions[0] == 0
+        np.testing.assert_allclose(found.value, expected.max(), rtol=1e-12)
 
 
 def test_bounds_by_functions_save_expansions():
@@ -208,7 +220,7 @@ def line_world():
     value = [np.zeros(6)]
     for _ in range(5):
         value.append(np.max(gain[moves] + value[-1][moves], axis=1))
-    return {"gain": jnp.asarray(gain), "value": jnp.stack(value, axis=1)}
+    return {"gain": gain, "value": np.stack(value, axis=1)}
 
 
 def move_on_line(key, world, state, action):
@@ -263,19 +275,19 @@ def test_counts_are_those_of_a_tree_that_is_visited_whole():
 
 
 def test_batch_and_jit_give_what_single_calls_give():
-    one = partial(plan, KEY, belief_of((0, 1), np.zeros(2)))
-    states = jnp.arange(NUM_STATES)
-    single = jax.tree.map(lambda *x: jnp.stack(x), *map(one, states))
+    states = np.arange(NUM_STATES)
+    single = [plan(KEY, certain(table(0)), state) for state in states]
+    single = jax.tree.map(lambda *x: np.stack(x), *single)
     assert len(np.unique(single.tree.num_expansions)) > 2
-    several = jax.jit(jax.vmap(one))(states)
+    several = jax.jit(jax.vmap(partial(traced, KEY, certain(table(0)))))(states)
     jax.tree.map(
         partial(np.testing.assert_allclose, rtol=1e-12, atol=1e-12), several, single
     )
 
 
 def test_single_precision_gives_the_same_decision(precision):
-    world = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), table(2))
-    found = plan(KEY, certain(world), jnp.asarray(4))
+    world = table(2)
+    found = plan(KEY, certain(world), 4)
     expected = whole_tree(world, 4)
     assert found.value.dtype == jnp.asarray(1.0).dtype
     assert found.tree.is_exact
@@ -284,18 +296,14 @@ def test_single_precision_gives_the_same_decision(precision):
 
 
 def test_arrays_and_numbers_of_the_world_do_not_compile_anew():
-    traces = []
-
-    def counted(key, world, state, action):
-        traces.append(0)
-        return transition(key, world, state, action)
-
+    plan(KEY, certain(table(0)), 0)
+    TRACES.clear()
     for seed in range(3):
-        options = {"transition_fn": counted, "discount": 0.8 + 0.05 * seed}
-        plan(jax.random.key(seed), certain(table(seed)), seed, **options)
-        if not seed:
-            first = len(traces)
-    assert len(traces) == first
+        discount = 0.8 + 0.05 * seed
+        plan(jax.random.key(seed), certain(table(seed)), seed, discount=discount)
+    assert not TRACES
+    plan(KEY, certain(table(0)), 0, num_samples=1)
+    assert TRACES
 
 
 @pytest.mark.parametrize(
