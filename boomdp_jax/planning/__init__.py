@@ -21,6 +21,8 @@ from boomdp_jax.planning.plan import Plan as Plan
 from boomdp_jax.planning.plan import SearchInfo as SearchInfo
 from boomdp_jax.planning.random_shooting import random_shooting as random_shooting
 from boomdp_jax.planning.sparse_sampling import sparse_sampling as sparse_sampling
+from boomdp_jax.planning.tree_levels import TreeLevel as TreeLevel
+from boomdp_jax.planning.tree_levels import tree_levels as tree_levels
 
 __all__ = [
     "Belief",
@@ -28,6 +30,7 @@ __all__ = [
     "PathReport",
     "Plan",
     "SearchInfo",
+    "TreeLevel",
     "a_star",
     "certain",
     "cross_entropy_method",
@@ -38,4 +41,5 @@ __all__ = [
     "random_shooting",
     "rollout_leaf",
     "sparse_sampling",
+    "tree_levels",
 ]
