@@ -82,9 +82,10 @@ def a_star(
     To be preferred to sampling where the model is known, has no noise and has a goal,
     and the leaf value leads there: with a leaf value of nothing, or one that leads
     astray, it visits every cell that is cheaper to reach than the goal. It takes
-    `num_actions` times the expansions in model calls, one batch after another. Hart,
-    Nilsson and Raphael (1968), "A formal basis for the heuristic determination of
-    minimum cost paths".
+    `num_actions` times the expansions in model calls, one batch after another. Over
+    many states `jax.lax.map` is several times faster on a processor than `jax.vmap`,
+    which copies all arrays in every round. Hart, Nilsson and Raphael (1968), "A formal
+    basis for the heuristic determination of minimum cost paths".
 
     Args:
         key: random key; one draw stands for each transition, the same for all actions

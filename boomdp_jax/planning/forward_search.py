@@ -78,8 +78,10 @@ def forward_search_sparse_sampling(
     At most `max_expansions` times `actions` times `num_samples` outcomes are drawn for
     each hypothesis. To be preferred to the whole tree where bounds of the return are
     tight; with loose ones nearly every node is visited, one after another, which the
-    whole tree does in parallel. Walsh, Goschin and Littman (2010), "Integrating
-    sample-based planning and model-based reinforcement learning".
+    whole tree does in parallel. Over many states `jax.lax.map` is several times faster
+    on a processor than `jax.vmap`, which copies whole trees in every round. Walsh,
+    Goschin and Littman (2010), "Integrating sample-based planning and model-based
+    reinforcement learning".
 
     Args:
         key: random key; the draws of a node depend on it and on where the node is in

@@ -67,7 +67,7 @@ class Target(NamedTuple):
 
 
 class OpenList(NamedTuple):
-    """Nodes to be expanded, best first."""
+    """What is to be expanded, and what tells whether more is."""
 
     priority: Float[Array, " node"]
     """The score; −∞ for what is not, or no more, to be expanded."""
