@@ -134,3 +134,11 @@ def test_third_example_says_where_the_recording_comes_from(tmp_path):
     result = run_example("03_real_pushes.py", tmp_path)
     assert result.returncode == 2
     assert "robinzhoucmu/Pushing" in result.stderr
+
+
+@pytest.mark.slow
+def test_fourth_example_plans_round_a_wall(tmp_path):
+    result = run_example("04_plan_round_a_wall.py", "--quick", "--out", tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "reached the goal: True" in result.stdout
+    assert_is_picture(tmp_path / "tree.png")

@@ -30,9 +30,9 @@ ALLOWED = {("cli", "experiments"), ("cli", "interop"), ("cli", "viz")}
 # A posterior's `plot` and `to_arviz` are doors to packages above, opened when called.
 ALLOWED_WHEN_CALLED = {("inference", "viz"), ("inference", "interop")}
 OWNERS = {"brax": "interop", "mujoco": "interop", "arviz": "interop"}
-OWNERS |= {"matplotlib": "viz", "ray": "interop"}
+OWNERS |= {"matplotlib": "viz", "ray": "interop", "mctx": "planning"}
 # What `import boomdp_jax` must not load.
-HEAVY = ["brax", "mujoco", "arviz", "matplotlib", "numpyro", "ray"]
+HEAVY = ["brax", "mujoco", "arviz", "matplotlib", "numpyro", "ray", "mctx"]
 
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

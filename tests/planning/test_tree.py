@@ -26,11 +26,11 @@ def plan_of(process, state, **options):
     ("depth", "num_samples", "is_common", "repeat"),
     [
         (1, 3, True, 1),
-        (3, 2, True, 1),
         (3, 2, False, 1),
-        (3, (3, 1, 2), True, 1),
-        (2, 2, True, 2),
-        (2, 1, False, 6),
+        (2, (3, 1), True, 2),
+        pytest.param(3, 2, True, 1, marks=pytest.mark.slow),
+        pytest.param(3, (3, 1, 2), True, 1, marks=pytest.mark.slow),
+        pytest.param(2, 1, False, 6, marks=pytest.mark.slow),
     ],
 )
 def test_full_tree_is_the_recursion(depth, num_samples, is_common, repeat):
@@ -61,6 +61,7 @@ def test_full_tree_is_the_recursion(depth, num_samples, is_common, repeat):
         assert int(plan.index) == int(np.argmax(expected))
 
 
+@pytest.mark.slow
 def test_error_falls_with_the_square_root_of_draws():
     process = random_process(3, 6, 2)
     expected = process.q_values(2, 0.95)[0]
@@ -83,6 +84,7 @@ def test_error_falls_with_the_square_root_of_draws():
     assert errors[1] / errors[2] == pytest.approx(2.0, rel=0.25)
 
 
+@pytest.mark.slow
 def test_merging_on_the_states_is_backward_induction():
     depth = 30
     for seed in range(3):
@@ -111,6 +113,7 @@ WANDERING = {
 }
 
 
+@pytest.mark.slow
 def test_merged_tree_is_the_full_one_where_nothing_merges():
     state, belief = jnp.array([0.4, -0.3]), (jnp.array([1.0, 0.5]), jnp.zeros(2))
     options = {"depth": 4, "num_samples": 2, **WANDERING}
@@ -174,29 +177,37 @@ def test_counts_add_up_and_agree_with_unique_cells():
     assert merged.sum() > 0
 
 
-def test_calls_are_counted():
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"depth": 2, "num_samples": 2},
+        {"depth": 2, "hypotheses": "fresh"},
+        pytest.param(
+            {"depth": 5, "num_samples": 1, "cell_size": 0.2, "capacity": 7},
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            {"depth": 3, "action_repeat": 2, "cell_size": "auto", "capacity": 5},
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_calls_are_counted(options):
     count = []
 
     def counted(key, hypothesis, state, action):
         jax.debug.callback(lambda *_: count.append(1), state, hypothesis)
         return wander(key, hypothesis, state, action)
 
-    for options in (
-        {"depth": 3, "num_samples": 2},
-        {"depth": 5, "num_samples": 1, "cell_size": 0.2, "capacity": 7},
-        {"depth": 3, "action_repeat": 2, "cell_size": "auto", "capacity": 5},
-        {"depth": 2, "hypotheses": "fresh"},
-    ):
-        count.clear()
-        plan = sparse_sampling(
-            jax.random.key(0),
-            (jnp.array([1.0, 0.5]), jnp.zeros(2)),
-            jnp.zeros(2),
-            **{**WANDERING, "transition_fn": counted, **options},
-        )
-        jax.effects_barrier()
-        jax.block_until_ready(plan.value)
-        assert len(count) == int(plan.info.num_model_calls)
+    plan = sparse_sampling(
+        jax.random.key(0),
+        (jnp.array([1.0, 0.5]), jnp.zeros(2)),
+        jnp.zeros(2),
+        **{**WANDERING, "transition_fn": counted, **options},
+    )
+    jax.effects_barrier()
+    jax.block_until_ready(plan.value)
+    assert len(count) == int(plan.info.num_model_calls)
 
 
 def test_mirrored_states_have_mirrored_values():
@@ -308,7 +319,11 @@ def test_what_is_not_finite_is_avoided():
     assert np.all(np.isfinite(plan.q_values))
 
 
-@pytest.mark.parametrize("overflow", OVERFLOW_POLICIES)
+@pytest.mark.parametrize(
+    "overflow",
+    [OVERFLOW_POLICIES[0]]
+    + [pytest.param(name, marks=pytest.mark.slow) for name in OVERFLOW_POLICIES[1:]],
+)
 def test_vmap_is_a_loop_and_jit_is_eager(overflow):
     options = {
         "depth": 5,
@@ -330,6 +345,7 @@ def test_vmap_is_a_loop_and_jit_is_eager(overflow):
     assert np.all(np.isfinite(looped))
 
 
+@pytest.mark.slow
 def test_stratified_gets_round_a_wall_that_the_bound_runs_into():
     # Straight at the goal is a pocket; the way round is at first a way back.
     def step(key, hypothesis, state, action):
