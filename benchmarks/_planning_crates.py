@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _planning_tasks import scene_of, single_body
+from _planning_task import scene_of, single_body
 
 from boomdp_jax.physics import step
 from boomdp_jax.planning import Belief, sparse_sampling

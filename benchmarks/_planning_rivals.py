@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from _planning_task import NUM_LEAF_STEPS
 from _planning_tasks import Task
 
 from boomdp_jax import planning
@@ -84,6 +85,15 @@ def rivals(
                 "depth": None,
                 "max_expansions": max(1, num_calls // (num_actions * held)),
                 "max_plan_length": task.depth,
+            },
+            False,
+        ),
+        "forward search": (
+            planning.forward_search_sparse_sampling,
+            {
+                "value_bounds": (-task.cost_bound, 0.0),
+                "leaf_bounds": (-NUM_LEAF_STEPS * task.cost_bound, 0.0),
+                "max_expansions": max(1, num_calls // (num_actions * held)),
             },
             False,
         ),

@@ -70,9 +70,9 @@ def _reduction(function, arguments: list, num_out: int) -> list:
     arrays = [a.reshape(flat) for a in arguments if a.shape]
     scalars = [a for a in arguments if not a.shape]
     num_slots = max(len(arrays), len(scalars), num_out)
-    if len(shape) == 1 and shape[0] >= _MANY:
+    if int(np.prod(shape)) >= _MANY:
         # A number more that nobody looks at.
-        scalars.append(one_by_sorting(sum(a[0] for a in arrays)))
+        scalars.append(one_by_sorting(sum(a.reshape(-1)[0] for a in arrays)))
         num_slots = max(num_slots, len(scalars))
     spare = arrays[0] if arrays else jnp.zeros((1,) * len(flat), dtype)
     zero = jnp.zeros((), dtype)

@@ -59,34 +59,17 @@ def merge(
         policy: one of `OVERFLOW_POLICIES`.
 
     Returns:
-        The nodes, and where each child points to. Three sorts of the children.
+        The nodes, and where each child points to.
     """
     number = jnp.arange(score.shape[0])
-    # Children by score: sorts below are stable, so that the best comes first in each.
-    by_score = _sorted(_descending(score, exists), number)[1]
-
-    cell_hash = jnp.where(exists, hash_of(cell), _LAST)
-    by_cell = _sorted(cell_hash[by_score], by_score)[1]
-    sorted_cell = cell[by_cell]
-    # Different cells of one hash stay apart, at worst in more than one piece.
-    differs = jnp.any(sorted_cell[1:] != sorted_cell[:-1], axis=1)
-    starts = jnp.concatenate([jnp.ones(1, bool), differs]) & exists[by_cell]
-    start = lax.cummax(jnp.where(starts, number, 0))
-    leader = jnp.zeros_like(number).at[by_cell].set(by_cell[start])
-    is_leader = (leader == number) & exists
-
-    # From here on in the order of scores.
-    leads = is_leader[by_score]
+    order = _ascending(score)
+    leader = _best_of_group(cell, order, exists)
+    is_leader = exists & (leader == number)
     if policy == "stratified":
-        coarse = jnp.where(leads, hash_of(stratum)[by_score], _LAST)
-        priority, rank = _in_turn(coarse, number)
-        priority = jnp.where(leads[rank], priority, -jnp.inf)
+        priority = _in_turn(stratum, order, is_leader, score, capacity)
     else:
-        rank = number
-        priority = _priority(key, policy, by_score, score[by_score])
-        priority = jnp.where(leads, priority, -jnp.inf)
-    best, position = lax.top_k(priority, capacity)
-    child = by_score[rank[position]]
+        priority = _priority(key, policy, number, score)
+    best, child = lax.top_k(jnp.where(is_leader, priority, -jnp.inf), capacity)
     is_taken = best > -jnp.inf
     place = jnp.full_like(number, -1)
     place = place.at[jnp.where(is_taken, child, score.shape[0])].set(
@@ -102,44 +85,98 @@ def merge(
     )
 
 
-_LAST = jnp.uint32(0xFFFFFFFF)
-
-
-def _descending(score: Array, exists: Array) -> UInt32[Array, " child"]:
-    """Unsigned numbers in the opposite order of the scores, what is not there last.
-
-    Sorting those is five times as fast on a CPU as sorting floats, whose comparison
-    has to mind what is not a number.
-    """
+def _ascending(score: Float[Array, " child"]) -> UInt32[Array, " child"]:
+    """Unsigned numbers in the order of the scores, for scatters to take the largest."""
     bits = lax.bitcast_convert_type(score.astype(jnp.float32), jnp.uint32)
-    is_negative = bits >> 31 == 1
-    ascending = jnp.where(is_negative, ~bits, bits | jnp.uint32(0x80000000))
-    return jnp.where(exists, ~ascending, _LAST)
+    return jnp.where(bits >> 31 == 1, ~bits, bits | jnp.uint32(0x80000000))
 
 
-def _sorted(keys: UInt32[Array, " child"], values: Int[Array, " child"]):
-    return lax.sort((keys, values), num_keys=1, is_stable=True)
+def _best_of_group(
+    cell: Int[Array, "child channel"],
+    order: UInt32[Array, " child"],
+    exists: Bool[Array, " child"],
+) -> Int[Array, " child"]:
+    """The best child of the same cell as each; the first one, where scores are equal.
+
+    By hash tables instead of sorting, which takes several times as long: the best
+    child of each slot wins it, those of its cell are done, and those that met another
+    cell in their slot go on to a table with other slots.
+    """
+    num = order.shape[0]
+    # Twice the slots that are needed, so that four fifths are done after one table.
+    num_bits = (2 * num - 1).bit_length()
+    mixed = hash_of(cell)
+
+    def one_table(carry):
+        leader, is_left, factor = carry
+        slot = ((mixed * factor) >> (32 - num_bits)).astype(jnp.int32)
+        winner = _best_of_slot(slot, order, is_left, 1 << num_bits)[slot]
+        is_found = is_left & jnp.all(cell == cell[winner], axis=1)
+        leader = jnp.where(is_found, winner, leader)
+        return leader, is_left & ~is_found, factor * _FACTOR
+
+    # Each table does one cell at least, so that there is an end even to equal hashes.
+    carry = (jnp.arange(num), exists, _FACTOR)
+    return lax.while_loop(lambda carry: jnp.any(carry[1]), one_table, carry)[0]
 
 
-def _in_turn(stratum: UInt32[Array, " child"], number: Int[Array, " child"]):
-    """Priorities by rank in one's stratum, then by score, and whose each is."""
-    sorted_stratum, rank = _sorted(stratum, number)
-    is_new = jnp.concatenate(
-        [jnp.ones(1, bool), sorted_stratum[1:] != sorted_stratum[:-1]]
+# Odd, and near the golden section of 2³²: products of its powers are well spread.
+_FACTOR = jnp.uint32(0x9E3779B1)
+
+
+def _best_of_slot(
+    slot: Int[Array, " child"],
+    order: UInt32[Array, " child"],
+    is_in: Bool[Array, " child"],
+    num_slots: int,
+) -> Int[Array, " slot"]:
+    """The first of the best children in each slot; of no meaning in an empty one."""
+    num = order.shape[0]
+    where = jnp.where(is_in, slot, num_slots)
+    best = jnp.zeros(num_slots, jnp.uint32).at[where].max(order, mode="drop")
+    where = jnp.where(best[slot] == order, where, num_slots)
+    first = jnp.full(num_slots, num - 1)
+    return first.at[where].min(jnp.arange(num), mode="drop")
+
+
+def _in_turn(
+    stratum: Int[Array, "child channel"],
+    order: UInt32[Array, " child"],
+    is_leader: Bool[Array, " child"],
+    score: Float[Array, " child"],
+    capacity: int,
+) -> Float[Array, " child"]:
+    """Priorities: all that were chosen before the last turn, then its own by score."""
+    number = jnp.arange(order.shape[0])
+    group = _best_of_group(stratum, order, is_leader)
+    num_wanted = jnp.minimum(capacity, jnp.sum(is_leader))
+
+    def one_turn(carry):
+        chosen, _ = carry
+        is_left = is_leader & ~chosen
+        best = _best_of_slot(group, order, is_left, number.shape[0])
+        return chosen | (is_left & (best[group] == number)), chosen
+
+    # There is nothing to choose where all have room.
+    is_room = jnp.sum(is_leader) <= capacity
+    first = is_leader & (is_room | (group == number))
+    chosen, before = lax.while_loop(
+        lambda carry: jnp.sum(carry[0]) < num_wanted,
+        one_turn,
+        (first, jnp.zeros_like(first)),
     )
-    turn = number - lax.cummax(jnp.where(is_new, number, 0))
-    turn, place = turn.astype(jnp.float32), rank.astype(jnp.float32)
-    return -(turn + place / number.shape[0]), rank
+    return jnp.where(before, jnp.inf, jnp.where(chosen, score, -jnp.inf))
 
 
-def _priority(key: Key, policy: str, child: Array, score: Array) -> Array:
-    """Priorities of children in the order of their scores."""
+def _priority(
+    key: Key, policy: str, number: Int[Array, " child"], score: Float[Array, " child"]
+) -> Float[Array, " child"]:
+    """Priorities of the other policies."""
     if policy == "bound":
-        return -jnp.arange(child.shape[0], dtype=jnp.float32)
+        return score
     if policy == "first":
-        return -child.astype(jnp.float32)
+        return -number.astype(score.dtype)
     if policy == "random":
-        return jax.random.uniform(key, child.shape)
+        return jax.random.uniform(key, score.shape)
     spread = jnp.std(score, where=jnp.isfinite(score))
-    noise = jax.random.gumbel(key, child.shape)
-    return (score / jnp.maximum(spread, 1e-12)).astype(jnp.float32) + noise
+    return score / jnp.maximum(spread, 1e-12) + jax.random.gumbel(key, score.shape)

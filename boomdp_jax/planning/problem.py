@@ -80,11 +80,13 @@ class Problem(eqx.Module):
             gain = jnp.asarray(self.reward_fn(hypothesis, state, action, moved))
             _check_scalar("reward_fn", gain)
             _check_scalar("transition_fn: done", jnp.asarray(done))
+            moved = jax.tree.map(lambda new, old: new.astype(old.dtype), moved, state)
+            if done is False:
+                # An episode without an end needs no looking whether it is over.
+                return (moved, reward + alive * gain, alive * self.discount), None
             reward = reward + jnp.where(alive > 0, alive * gain, 0.0)
             state = jax.tree.map(
-                lambda new, old: jnp.where(alive > 0, new, old).astype(old.dtype),
-                moved,
-                state,
+                lambda new, old: jnp.where(alive > 0, new, old), moved, state
             )
             alive = jnp.where(done, 0.0, alive * self.discount)
             return (state, reward, alive), None
