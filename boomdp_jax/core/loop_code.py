@@ -9,8 +9,8 @@ import numpy as np
 from boomdp_jax.core.scalar_parts import parts_of
 from boomdp_jax.core.unmerged import one_by_sorting
 
-# Numbers in a vector from which a loop that it is worked out in should not be merged
-# (`unmerged`); of arrays of more axes whoever writes the loop knows best.
+# Numbers in a batch from which a loop that it is worked out in should not be merged
+# (`unmerged`), however many `vmap`s made the batch.
 _MANY = 8
 
 

@@ -1,5 +1,6 @@
 """Functions of scalars in one loop: plain JAX's numbers, in every transform."""
 
+import functools
 import re
 
 import jax
@@ -178,18 +179,23 @@ def test_it_is_one_loop_when_compiled():
     assert loops(looped) == 1 < loops(chain)
 
 
-@pytest.mark.parametrize(("num", "is_sorted"), [(64, True), (4, False)])
-def test_loops_over_time_are_not_merged_for_many(num, is_sorted):
+@pytest.mark.parametrize(
+    ("shape", "is_sorted"),
+    [((64,), True), ((1, 64), True), ((8, 8), True), ((4,), False), ((2, 2), False)],
+)
+def test_loops_over_time_are_not_merged_for_many(shape, is_sorted):
     """A sort keeps the backend from writing them as one slow function (`unmerged`)."""
+    batched = functools.reduce(lambda f, _: jax.vmap(f), shape, looped)
 
     def run(place, force):
         def advance(x, _):
-            out = jax.vmap(looped)({"x": x, "y": place["y"]}, force)
+            out = batched({"x": x, "y": place["y"]}, force)
             return 0.5 * out["gap"], out["product"]
 
         return jax.lax.scan(advance, place["x"], None, length=6)[1]
 
-    x, y, force = (0.1 * jnp.arange(3 * num, dtype=jnp.float32)).reshape(3, num)
+    numbers = 0.1 * jnp.arange(3 * np.prod(shape), dtype=jnp.float32)
+    x, y, force = numbers.reshape(3, *shape)
     for function in (run, jax.grad(lambda p, f: jnp.sum(run(p, f)))):
         text = jax.jit(function).lower({"x": x, "y": y}, force).compile().as_text()
         assert (" sort(" in text) == is_sorted
