@@ -2,6 +2,8 @@
 
 from boomdp_jax.interop.arviz import to_arviz as to_arviz
 from boomdp_jax.interop.mjcf import RecordingLaws as RecordingLaws
+from boomdp_jax.interop.mjcf_export import save_mjcf as save_mjcf
+from boomdp_jax.interop.mjcf_export import to_mjcf as to_mjcf
 from boomdp_jax.interop.object_families import FAMILIES as FAMILIES
 from boomdp_jax.interop.object_families import hide as hide
 from boomdp_jax.interop.object_families import random_object as random_object
@@ -23,7 +25,9 @@ __all__ = [
     "random_pushes",
     "record",
     "record_random_pushes",
+    "save_mjcf",
     "sweep_with_ray",
     "to_arviz",
+    "to_mjcf",
     "with_reading_noise",
 ]

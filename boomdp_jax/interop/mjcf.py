@@ -7,11 +7,12 @@ feet share the weight as statics has it, contacts creep.
 
 import dataclasses
 import math
-from collections.abc import Iterable
+import xml.etree.ElementTree as ET
 from typing import Literal
 
 import numpy as np
 
+from boomdp_jax.interop.mjcf_elements import numbers, velocity_force
 from boomdp_jax.physics.params import Params, Wheel
 from boomdp_jax.physics.scene_spec import STANDARD_GRAVITY, SceneSpec
 
@@ -77,15 +78,15 @@ def world_text(truth: SceneSpec, params: Params, laws: RecordingLaws) -> str:
     return f"""
 <mujoco>
   <compiler angle="radian"/>
-  <option timestep="{laws.time_step}" gravity="{_numbers(gravity)}" cone="elliptic"
+  <option timestep="{laws.time_step}" gravity="{numbers(gravity)}" cone="elliptic"
     integrator="{integrator}" impratio="10" tolerance="1e-12" iterations="200"/>
   <worldbody>
     <geom name="floor" type="plane" size="0 0 1" pos="0 0 {-_HEIGHT}"
       contype="0" conaffinity="0"/>
-    <body name="object" pos="{_numbers((*place, 0.0))}">
+    <body name="object" pos="{numbers((*place, 0.0))}">
       {parts.joints}
       <inertial pos="0 0 0" mass="{mass}"
-        diaginertia="{_numbers((*tilts, inertia))}"/>
+        diaginertia="{numbers((*tilts, inertia))}"/>
       {parts.children}
     </body>
   </worldbody>
@@ -156,7 +157,7 @@ def _add_joints(
             turn.add(0.0, limit * float(body.foot_load @ arms))
     theta = f'<joint name="theta" type="hinge" axis="0 0 1" {turn.text()}'
     if has_hinge:
-        parts.joints += f'{theta} pos="{_numbers((*centre, 0.0))}"/>'
+        parts.joints += f'{theta} pos="{numbers((*centre, 0.0))}"/>'
     else:
         for name, axis in (("x", "1 0 0"), ("y", "0 1 0")):
             parts.joints += (
@@ -164,7 +165,7 @@ def _add_joints(
             )
         parts.joints += f"{theta}/>"
     if is_pinned and not has_hinge:
-        at = _numbers((*revolute.anchor_a[0], 0.0))
+        at = numbers((*revolute.anchor_a[0], 0.0))
         parts.equalities += (
             f'<connect body1="object" anchor="{at}" solref="{2 * laws.time_step} 1" '
             'solimp="0.9999 0.9999 0.001"/>'
@@ -204,15 +205,9 @@ def _add_wheel(parts: _Parts, params: Params, laws: RecordingLaws, mass: float) 
         is_contact = laws.wheel == "contacts" and math.isfinite(limit)
         if viscous == 0.0 or limit == 0.0 or is_contact:
             continue
-        gear = ["0"] * 6
-        gear[axis] = "1"
-        bound = ""
-        if math.isfinite(limit):
-            bound = f'forcelimited="true" forcerange="{-limit} {limit}"'
-        parts.actuators += (
-            f'<general site="wheel" gear="{" ".join(gear)}" gainprm="0" '
-            f'biastype="affine" biasprm="0 0 {-viscous}" {bound}/>'
-        )
+        gear = ("1 0 0 0 0 0", "0 1 0 0 0 0")[axis]
+        law = velocity_force(viscous, limit, site="wheel", gear=gear)
+        parts.actuators += ET.tostring(ET.Element("general", law), "unicode")
     if laws.wheel == "contacts":
         _add_axle(parts, wheel, laws, mass)
 
@@ -236,7 +231,7 @@ def _add_axle(parts: _Parts, wheel: Wheel, laws: RecordingLaws, mass: float) -> 
       <body name="axle" pos="{x} {y} {FOOT_RADIUS - _HEIGHT}">
         <joint name="press" type="slide" axis="0 0 1" armature="{0.1 * mass}"/>
         <inertial pos="0 0 0" mass="{1e-6 * mass}"
-          diaginertia="{_numbers([1e-8 * mass] * 3)}"/>
+          diaginertia="{numbers([1e-8 * mass] * 3)}"/>
         <geom name="axle" type="capsule" size="{FOOT_RADIUS}"
           fromto="{-dx} {-dy} 0 {dx} {dy} 0" contype="0" conaffinity="0"/>
       </body>"""
@@ -266,8 +261,3 @@ def _pair(geom: str, friction: tuple[float, float]) -> str:
         f'solimp="0.98 0.99 0.001" '
         f'friction="{friction[0]} {friction[1]} 0.0001 0.0001 0.0001"/>'
     )
-
-
-def _numbers(values: Iterable[float | np.floating]) -> str:
-    """Numbers as an attribute, to the last digit."""
-    return " ".join(repr(float(value)) for value in values)
