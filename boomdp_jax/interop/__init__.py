@@ -4,6 +4,9 @@ from boomdp_jax.interop.arviz import to_arviz as to_arviz
 from boomdp_jax.interop.mjcf import RecordingLaws as RecordingLaws
 from boomdp_jax.interop.mjcf_export import save_mjcf as save_mjcf
 from boomdp_jax.interop.mjcf_export import to_mjcf as to_mjcf
+from boomdp_jax.interop.mjcf_import import from_mjcf as from_mjcf
+from boomdp_jax.interop.mjx import brax_randomisation as brax_randomisation
+from boomdp_jax.interop.mjx import randomise_mjx as randomise_mjx
 from boomdp_jax.interop.object_families import FAMILIES as FAMILIES
 from boomdp_jax.interop.object_families import hide as hide
 from boomdp_jax.interop.object_families import random_object as random_object
@@ -20,9 +23,12 @@ __all__ = [
     "FAMILIES",
     "READING_NOISE",
     "RecordingLaws",
+    "brax_randomisation",
+    "from_mjcf",
     "hide",
     "random_object",
     "random_pushes",
+    "randomise_mjx",
     "record",
     "record_random_pushes",
     "save_mjcf",

@@ -13,7 +13,7 @@ has no coefficient of restitution: a spring and damper give it back.
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Float
@@ -126,7 +126,7 @@ def bounce_spring(restitution: float, time_step: float) -> tuple[float, float]:
     return -(rate**2), -2.0 * ratio * rate
 
 
-def restitution_of(solref: Sequence[float]) -> float:
+def restitution_of(solref: Float[np.ndarray, "2"]) -> float:
     """The restitution that `bounce_spring` was given; zero of a usual contact.
 
     Args:
@@ -144,8 +144,8 @@ def restitution_of(solref: Sequence[float]) -> float:
 def _restitution(ratio: float) -> float:
     r"""What a spring and damper that do not pull give back of a speed.
 
-    With a damping ratio of $\sin\alpha$ it is $e^{-(\pi - 2\alpha)\tan\alpha}$, with one
-    of $\zeta > 1$ it is $(\zeta + s)^{-2\zeta/s}$, $s = \sqrt{\zeta^2 - 1}$. Schwager and
+    With a damping ratio of $\sin\alpha$ it is $e^{-(\pi - 2\alpha)\tan\alpha}$, with
+    $\zeta > 1$ it is $(\zeta + s)^{-2\zeta/s}$, $s = \sqrt{\zeta^2 - 1}$. Schwager and
     Pöschel (2007), "Coefficient of restitution and linear-dashpot model revisited".
     """
     if abs(ratio - 1.0) < 1e-9:

@@ -7,7 +7,6 @@ recording serves many noise levels.
 """
 
 import dataclasses
-import importlib
 import types
 from typing import Any
 
@@ -17,6 +16,7 @@ from jaxtyping import Float, Int
 
 from boomdp_jax.core.transition_table import TransitionTable
 from boomdp_jax.interop.mjcf import RecordingLaws, has_contacts, world_text
+from boomdp_jax.interop.mjcf_document import load_mujoco
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene_spec import SceneSpec
 
@@ -142,16 +142,6 @@ def _single_object(truth: SceneSpec) -> Params:
     return params
 
 
-def _load_mujoco() -> types.ModuleType:
-    try:
-        return importlib.import_module("mujoco")
-    except ImportError as error:
-        raise ImportError(
-            "recordings are made in MuJoCo, which is not installed; "
-            "pip install 'boomdp_jax[test]'"
-        ) from error
-
-
 @dataclasses.dataclass
 class _World:
     """A MuJoCo model of one object, and how its joints are read."""
@@ -170,7 +160,7 @@ class _World:
 
     @classmethod
     def build(cls, truth: SceneSpec, params: Params, laws: RecordingLaws) -> "_World":
-        mujoco = _load_mujoco()
+        mujoco = load_mujoco()
         model = mujoco.MjModel.from_xml_string(world_text(truth, params, laws))
         is_pinned = bool(params.revolute.active.any())
         anchor, pin = np.zeros(2), None
