@@ -13,10 +13,10 @@ from boomdp_jax.planning.belief import Belief
 class AbstractModel(eqx.Module):
     """How the bodies of one scene move, as far as is known: init, update, sample.
 
-    What has been learnt is a pytree of fixed shapes; `sample` turns it into a belief for
-    a planner, and `transition` says what one hypothesis of it expects. A model whose
-    `is_compiled` is true has pure functions throughout, so that a whole episode can be
-    one scan; another one's `update` runs on the host.
+    What has been learnt is a pytree of fixed shapes; `sample` turns it into a belief
+    for a planner, and `transition` says what one hypothesis of it expects. A model
+    whose `is_compiled` is true has pure functions throughout, so that a whole episode
+    can be one scan; another one's `update` runs on the host.
     """
 
     is_compiled: eqx.AbstractClassVar[bool]
@@ -49,7 +49,7 @@ class AbstractModel(eqx.Module):
             state: reading before the step; NaN marks what is missing.
             wrench: at the centres of mass, held over the scene's time step [N, N, N m].
             next_state: reading after it.
-            starts_episode: whether bodies were moved otherwise since the last transition.
+            starts_episode: whether bodies were moved otherwise since the last one.
 
         Returns:
             What has been learnt now.

@@ -1,0 +1,15 @@
+"""Transition models that an agent can learn: regressions, ensembles, point fits."""
+
+from boomdp_jax.models.features import BodyFeatures as BodyFeatures
+from boomdp_jax.models.linear import LinearRegression as LinearRegression
+from boomdp_jax.models.model import AbstractModel as AbstractModel
+from boomdp_jax.models.regression import AbstractRegressor as AbstractRegressor
+from boomdp_jax.models.regression import BodyRegression as BodyRegression
+
+__all__ = [
+    "AbstractModel",
+    "AbstractRegressor",
+    "BodyFeatures",
+    "BodyRegression",
+    "LinearRegression",
+]
