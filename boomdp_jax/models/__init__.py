@@ -2,6 +2,7 @@
 
 from boomdp_jax.models.features import BodyFeatures as BodyFeatures
 from boomdp_jax.models.linear import LinearRegression as LinearRegression
+from boomdp_jax.models.locally_weighted import LocallyWeighted as LocallyWeighted
 from boomdp_jax.models.model import AbstractModel as AbstractModel
 from boomdp_jax.models.regression import AbstractRegressor as AbstractRegressor
 from boomdp_jax.models.regression import BodyRegression as BodyRegression
@@ -12,4 +13,5 @@ __all__ = [
     "BodyFeatures",
     "BodyRegression",
     "LinearRegression",
+    "LocallyWeighted",
 ]

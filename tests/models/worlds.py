@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -60,31 +61,34 @@ def ride(num_steps: int, seed: int = 0):
     return before, wrench, after
 
 
+@eqx.filter_jit
 def learn(model, rows, key=None):
     """All rows, one after the other, in one compiled loop."""
     key = jax.random.key(0) if key is None else key
-    before, wrench, after = rows
 
     def take(learnt, row):
         return model.update(learnt, *row), None
 
-    return jax.jit(lambda first: jax.lax.scan(take, first, (before, wrench, after))[0])(
-        model.init(key)
-    )
+    return jax.lax.scan(take, model.init(key), rows)[0]
 
 
+@eqx.filter_jit
 def expected(model, learnt, rows, key=None) -> State:
     """What the first hypothesis expects of every row."""
     key = jax.random.key(1) if key is None else key
     before, wrench, _ = rows
+    hypothesis = model.sample(key, learnt, 1)[0]
+    return jax.vmap(lambda s, w: model.transition(key, hypothesis, s, w))(
+        before, wrench
+    )
 
-    def predict(learnt):
-        hypothesis = model.sample(key, learnt, 1)[0]
-        return jax.vmap(lambda s, w: model.transition(key, hypothesis, s, w))(
-            before, wrench
-        )
 
-    return jax.jit(predict)(learnt)
+def only(rows, num: int):
+    """The same rows, none of them read but the first few."""
+    before, wrench, after = rows
+    is_read = jnp.arange(len(wrench)) < num
+    pose = jnp.where(is_read[:, None, None], after.pose, jnp.nan)
+    return before, wrench, State(pose, after.twist)
 
 
 def part(rows, start: int, stop: int):
