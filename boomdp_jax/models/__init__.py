@@ -4,6 +4,8 @@ from boomdp_jax.models.features import BodyFeatures as BodyFeatures
 from boomdp_jax.models.linear import LinearRegression as LinearRegression
 from boomdp_jax.models.locally_weighted import LocallyWeighted as LocallyWeighted
 from boomdp_jax.models.model import AbstractModel as AbstractModel
+from boomdp_jax.models.object_oriented import ObjectOriented as ObjectOriented
+from boomdp_jax.models.outline_contact import touched_sectors as touched_sectors
 from boomdp_jax.models.regression import AbstractRegressor as AbstractRegressor
 from boomdp_jax.models.regression import BodyRegression as BodyRegression
 
@@ -14,4 +16,6 @@ __all__ = [
     "BodyRegression",
     "LinearRegression",
     "LocallyWeighted",
+    "ObjectOriented",
+    "touched_sectors",
 ]
