@@ -1,9 +1,11 @@
 """Transition models that an agent can learn: regressions, ensembles, point fits."""
 
 from boomdp_jax.models.features import BodyFeatures as BodyFeatures
+from boomdp_jax.models.gaussian_process import GaussianProcess as GaussianProcess
 from boomdp_jax.models.linear import LinearRegression as LinearRegression
 from boomdp_jax.models.locally_weighted import LocallyWeighted as LocallyWeighted
 from boomdp_jax.models.model import AbstractModel as AbstractModel
+from boomdp_jax.models.neural_ensemble import NeuralEnsemble as NeuralEnsemble
 from boomdp_jax.models.object_oriented import ObjectOriented as ObjectOriented
 from boomdp_jax.models.outline_contact import touched_sectors as touched_sectors
 from boomdp_jax.models.regression import AbstractRegressor as AbstractRegressor
@@ -14,8 +16,10 @@ __all__ = [
     "AbstractRegressor",
     "BodyFeatures",
     "BodyRegression",
+    "GaussianProcess",
     "LinearRegression",
     "LocallyWeighted",
+    "NeuralEnsemble",
     "ObjectOriented",
     "touched_sectors",
 ]

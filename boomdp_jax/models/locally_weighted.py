@@ -158,7 +158,7 @@ class LocallyWeighted(AbstractRegressor):
         bandwidths = jnp.asarray(self.bandwidths, fit.bandwidth.dtype)
         ridges = jnp.asarray(self.ridges, fit.ridge.dtype)
         spread = scaling_of(fit.table.targets, fit.table.mask).spread
-        place, num = spread_rows(fit.table, min(self.num_held_out, self.capacity))
+        place, is_row = spread_rows(fit.table, min(self.num_held_out, self.capacity))
         points, group = rows.points[place], rows.group[place]
         targets = fit.table.targets[place] / spread[None]
         is_other = place[:, None] != jnp.arange(self.capacity)[None]
@@ -173,12 +173,13 @@ class LocallyWeighted(AbstractRegressor):
                 told = jax.vmap(lambda one, point: _level(one, point, ridge))(
                     sums, points
                 )
-                return jnp.mean((told / spread[None] - targets) ** 2)
+                square = (told / spread[None] - targets) ** 2
+                return jnp.sum(jnp.where(is_row[:, None], square, 0.0))
 
             return jax.vmap(error_at)(ridges)
 
         errors = jax.lax.map(errors_at, bandwidths)
-        best = jnp.argmin(jnp.where(num > 1, errors, 0.0))
+        best = jnp.argmin(errors)
         return LocalFit(
             table=fit.table,
             bandwidth=bandwidths[best // len(self.ridges)],

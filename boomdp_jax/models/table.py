@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar
+from boomdp_jax.core.arrays import BoolScalar, IntScalar
 
 # Of a column's mean: spreads below this share are rounding, not information.
 _LEAST_SPREAD = 1e-6
@@ -192,19 +192,21 @@ def has_grown(table: Table, num_tuned: IntScalar) -> BoolScalar:
     return table.num_seen >= least
 
 
-def spread_rows(table: Table, num: int) -> tuple[Int[Array, " chosen"], FloatScalar]:
-    """Rows in use at equal steps through the table, and how many those are at least.
+def spread_rows(
+    table: Table, num: int
+) -> tuple[Int[Array, " chosen"], Bool[Array, " chosen"]]:
+    """Rows in use at equal steps through the table, or all if they are no more.
 
     Args:
         table: rows, the first ones in use.
-        num: how many to choose; some come twice where there are fewer.
+        num: how many to choose, at most the capacity.
 
     Returns:
-        Their places, and the number of rows as a float, at least one.
+        Their places, and which of these are rows in use.
     """
-    num_rows = table.num_rows
-    place = jnp.arange(num) * num_rows // num
-    return place, jnp.maximum(num_rows, 1).astype(table.inputs.dtype)
+    index, num_rows = jnp.arange(num), table.num_rows
+    place = jnp.where(num_rows <= num, index, index * num_rows // num)
+    return place, index < num_rows
 
 
 def check_at_least(name: str, value: float | int, least: float | int) -> None:
