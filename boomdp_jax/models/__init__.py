@@ -8,6 +8,9 @@ from boomdp_jax.models.model import AbstractModel as AbstractModel
 from boomdp_jax.models.neural_ensemble import NeuralEnsemble as NeuralEnsemble
 from boomdp_jax.models.object_oriented import ObjectOriented as ObjectOriented
 from boomdp_jax.models.outline_contact import touched_sectors as touched_sectors
+from boomdp_jax.models.point_fit import CmaEs as CmaEs
+from boomdp_jax.models.point_fit import GaussNewton as GaussNewton
+from boomdp_jax.models.point_fit import PointFit as PointFit
 from boomdp_jax.models.regression import AbstractRegressor as AbstractRegressor
 from boomdp_jax.models.regression import BodyRegression as BodyRegression
 
@@ -16,10 +19,13 @@ __all__ = [
     "AbstractRegressor",
     "BodyFeatures",
     "BodyRegression",
+    "CmaEs",
+    "GaussNewton",
     "GaussianProcess",
     "LinearRegression",
     "LocallyWeighted",
     "NeuralEnsemble",
     "ObjectOriented",
+    "PointFit",
     "touched_sectors",
 ]

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from boomdp_jax.core.arrays import FloatScalar
+from boomdp_jax.core.arrays import FloatScalar, IntScalar
 from boomdp_jax.models.table import check_at_least
 
 _DAMPING_FACTORS = (0.1, 1.0, 10.0)
@@ -24,14 +24,16 @@ def gauss_newton(
     residual_fn: Callable[[Float[Array, " dim"]], Float[Array, " residual"]],
     start: Float[Array, " dim"],
     *,
-    num_steps: int = 15,
+    num_steps: IntScalar | int = 15,
 ) -> tuple[Float[Array, " dim"], FloatScalar]:
     """Make a sum of squares small, from one start; `vmap` for many.
+
+    The residuals are compiled twice, with derivatives and without.
 
     Args:
         residual_fn: what is squared; not finite where a point is impossible.
         start: where to begin.
-        num_steps: how often to linearise.
+        num_steps: how often to linearise, at least once; may be known only at run time.
 
     Returns:
         The last point, never worse than the start, and its sum of squares.
@@ -39,13 +41,17 @@ def gauss_newton(
     Raises:
         ValueError: no step.
     """
-    check_at_least("num_steps", num_steps, 1)
-    start_loss = sum_of_squares(residual_fn(start))
+    if isinstance(num_steps, int):
+        check_at_least("num_steps", num_steps, 1)
 
-    def move(carry: tuple, _: None) -> tuple[tuple, None]:
-        point, loss, damping = carry
+    def twice(point: Array) -> tuple[Array, Array]:
         residual = residual_fn(point)
-        jacobian = jax.jacfwd(residual_fn)(point)
+        return residual, residual
+
+    def move(_: IntScalar, carry: tuple) -> tuple:
+        point, _, damping = carry
+        jacobian, residual = jax.jacfwd(twice, has_aux=True)(point)
+        loss = sum_of_squares(residual)
         # One direction that derivatives say nothing of must not spoil the others.
         jacobian = jnp.where(jnp.isfinite(jacobian), jacobian, 0.0)
         residual = jnp.where(jnp.isfinite(residual), residual, 0.0)
@@ -67,10 +73,14 @@ def gauss_newton(
             jnp.where(is_better, points[best], point),
             jnp.where(is_better, losses[best], loss),
             jnp.clip(damping, *_DAMPING_LIMITS),
-        ), None
+        )
 
-    first = (start, start_loss, jnp.asarray(_FIRST_DAMPING, start.dtype))
-    (point, loss, _), _ = jax.lax.scan(move, first, None, num_steps)
+    first = (
+        start,
+        jnp.asarray(jnp.inf, start.dtype),
+        jnp.asarray(_FIRST_DAMPING, start.dtype),
+    )
+    point, loss, _ = jax.lax.fori_loop(0, num_steps, move, first)
     return point, loss
 
 

@@ -4,9 +4,9 @@ Every moving body has a density, a wheel and a floor beneath it, whether it need
 or not; a friction that is not there is one whose coefficient goes to zero. Numbers are
 coordinates of size one, free from minus to plus infinity:
 
-- logarithms of the density, of viscous coefficients over the body's mass [1/s], of the
-  wheel's rolling and lateral ones and of the floor's, and of the floor's coefficient of
-  dry friction (`Ground`);
+- logarithms of the density, of the wheel's viscous coefficients over the body's mass
+  [1/s] and of its dry limits over the weight, each rolling and lateral, of the floor's
+  viscous coefficient over the mass [1/s], and of its coefficient of dry friction;
 - the wheel's place as a share of the outline's reach, $r \sin z$, and its heading.
 
 With a pin there are, besides, the anchor's place in the body, likewise, and a gate: the
@@ -24,12 +24,13 @@ from jaxtyping import Array, Float
 
 from boomdp_jax.physics.params import WORLD, Params, Revolute, empty_params
 from boomdp_jax.physics.scene import Scene
+from boomdp_jax.physics.scene_spec import STANDARD_GRAVITY
 
-# Middle and spread of the logarithms: density [kg/m²], rates of the wheel (rolling,
-# lateral) and of the floor [1/s], and coefficient of dry friction. Wide enough for a
-# friction to be next to nothing, or to hold a body fast.
-_LOG_MIDDLE = np.log([30.0, 0.3, 3.0, 0.3, 0.1])
-_LOG_SPREAD = np.array([1.5, 2.5, 2.5, 2.5, 2.0])
+# Middle and spread of the logarithms: density [kg/m²], rates [1/s] and limits of the
+# wheel (rolling, lateral), rate of the floor, and coefficient of dry friction. Wide
+# enough for a friction to be next to nothing, purely viscous, or to hold a body fast.
+_LOG_MIDDLE = np.log([30.0, 0.3, 5.0, 3.0, 3.0, 1.0, 0.1])
+_LOG_SPREAD = np.array([1.5, 2.5, 2.5, 2.0, 2.0, 2.5, 2.0])
 _NUM_LOGS = len(_LOG_MIDDLE)
 _NUM_PLAIN = _NUM_LOGS + 3
 
@@ -82,6 +83,7 @@ class PhysicsNumbers(eqx.Module):
         place = reach[:, None] * jnp.sin(z[:, _NUM_LOGS : _NUM_LOGS + 2])
         heading = 0.5 * jnp.pi * z[:, _NUM_LOGS + 2]
         rates = mass[:, None] * value[:, 1:3]
+        limits = STANDARD_GRAVITY * mass[:, None] * value[:, 3:5]
 
         def put(column: Array, values: Array) -> Array:
             return column.at[index].set(values.astype(column.dtype))
@@ -96,13 +98,13 @@ class PhysicsNumbers(eqx.Module):
                 position=put(empty.wheel.position, place[:, None]),
                 heading=put(empty.wheel.heading, heading[:, None]),
                 viscous=put(empty.wheel.viscous, rates[:, None]),
-                dry=jnp.full_like(empty.wheel.dry, jnp.inf),
+                dry=put(empty.wheel.dry, limits[:, None]),
             ),
             ground=dataclasses.replace(
                 empty.ground,
                 active=is_moving,
-                dry=put(empty.ground.dry, value[:, 4:5]),
-                viscous=put(empty.ground.viscous, (mass * value[:, 3])[:, None]),
+                dry=put(empty.ground.dry, value[:, 6:7]),
+                viscous=put(empty.ground.viscous, (mass * value[:, 5])[:, None]),
             ),
         )
         if not self.has_pin:
