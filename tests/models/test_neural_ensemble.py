@@ -1,3 +1,4 @@
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,6 +51,7 @@ def test_every_member_learns_a_linear_system(is_probabilistic):
     assert np.all(np.std(told, axis=0) > 0)
 
 
+@pytest.mark.slow
 def test_members_learn_how_noisy_targets_are():
     rng = np.random.default_rng(1)
     inputs = rng.normal(size=(150, 1))
@@ -81,21 +83,28 @@ def test_a_bootstrap_draws_each_row_once_on_average():
     assert abs(drawn.var() - 1) < 4.5 * np.sqrt(3 / 20_000)
 
 
-def test_nothing_known_means_coasting_and_members_are_hypotheses(precision):
+def test_nothing_known_means_coasting_and_members_are_hypotheses():
+    model = BodyRegression(cart().scene, NeuralEnsemble(**SMALL))
+    rows = part(ride(120), 0, 12)
+    learnt = eqx.filter_jit(model.init)(jax.random.key(0))
+    told = expected(model, learnt, rows)
+    np.testing.assert_array_equal(told.twist, rows[0].twist)
+    key = jax.random.key(0)
+    draw = eqx.filter_jit(lambda num: model.sample(key, learnt, num))
+    assert draw(10).num_hypotheses == 3
+    two = draw(2)
+    assert two.num_hypotheses == 2
+    first = two.hypotheses.layers[0].weight
+    assert not np.array_equal(first[0], first[1])
+
+
+@pytest.mark.slow
+def test_a_few_rows_are_enough_to_be_finite(precision):
     model = BodyRegression(cart().scene, NeuralEnsemble(**SMALL, num_steps=2))
     rows = jax.tree.map(lambda leaf: leaf.astype(float), part(ride(120), 0, 12))
     for num_rows in (0, 1, 12):
         learnt = learn(model, only(rows, num_rows))
-        told = expected(model, learnt, rows)
-        assert np.all(np.isfinite(told.array))
-        if num_rows == 0:
-            np.testing.assert_array_equal(told.twist, rows[0].twist)
-    key = jax.random.key(0)
-    assert model.sample(key, learnt, 10).num_hypotheses == 3
-    two = model.sample(key, learnt, 2)
-    assert two.num_hypotheses == 2
-    first = two.hypotheses.layers[0].weight
-    assert not np.array_equal(first[0], first[1])
+        assert np.all(np.isfinite(expected(model, learnt, rows).array))
 
 
 @pytest.mark.slow
