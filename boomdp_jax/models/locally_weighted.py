@@ -14,7 +14,8 @@ $$\bar y + G^T (C + \lambda I)^{-1} (q - \bar x),$$
 one system with one right-hand side. All sums over rows are one product of the weights
 with a matrix of every row's squares and products, which does not depend on q: for a
 batch of queries, two products of matrices, an exponential for each pair, and the
-systems. Bandwidth and λ are those of the least leave-one-out error.
+systems. No prediction leaves the range of targets by more than half of it. Bandwidth
+and λ are those of the least leave-one-out error.
 
 Rows may belong to groups (conditions of contact), each a regression by itself; a query
 of a group without rows is answered by group zero.
@@ -47,6 +48,10 @@ _BANDWIDTHS = (0.3, 0.6, 1.0, 1.5, 2.5, 4.0, 8.0)
 # Per weight; the least is what rounding allows in 32 bit.
 _RIDGES = (1e-5, 1e-3, 1e-1)
 _FIRST_RIDGE = 1e-3
+# By which share of their range predictions may leave that of the targets seen. Away
+# from all rows a slope has no end: without this a cart in the open that was learnt in
+# the world frame is soon predicted at six times the error of coasting.
+_BEYOND = 0.5
 
 
 class LocalFit(eqx.Module):
@@ -73,6 +78,9 @@ class LocalRows(eqx.Module):
     group: Int[Array, "*batch row"]
     bandwidth: Float[Array, "*batch"]
     ridge: Float[Array, "*batch"]
+    low: Float[Array, "*batch output"]
+    """Least of what may be predicted."""
+    high: Float[Array, "*batch output"]
 
 
 class LocallyWeighted(AbstractRegressor):
@@ -202,7 +210,8 @@ class LocallyWeighted(AbstractRegressor):
         del key
         point = hypothesis.scaling(inputs)
         sums = self._sums(hypothesis, point, jnp.asarray(group), hypothesis.mask)
-        return _level(sums, point, hypothesis.ridge)
+        level = _level(sums, point, hypothesis.ridge)
+        return jnp.clip(level, hypothesis.low, hypothesis.high)
 
     def _sums(
         self,
@@ -231,6 +240,12 @@ def local_rows(fit: LocalFit) -> LocalRows:
     table = fit.table
     scaling = scaling_of(table.inputs, table.mask)
     points = jnp.where(table.mask[:, None], scaling(table.inputs), 0.0)
+    is_any = jnp.any(table.mask)
+    far = jnp.where(is_any, jnp.inf, 0.0).astype(points.dtype)
+    low, high = (
+        bound(jnp.where(table.mask[:, None], table.targets, sign * far), axis=0)
+        for bound, sign in ((jnp.min, 1.0), (jnp.max, -1.0))
+    )
     upper = np.triu_indices(points.shape[1])
     cross = points[:, :, None] * table.targets[:, None, :]
     parts = [
@@ -248,6 +263,8 @@ def local_rows(fit: LocalFit) -> LocalRows:
         group=table.group,
         bandwidth=fit.bandwidth,
         ridge=fit.ridge,
+        low=low - _BEYOND * (high - low),
+        high=high + _BEYOND * (high - low),
     )
 
 

@@ -107,7 +107,7 @@ class GaussNewton(AbstractSearch):
 class CmaEs(AbstractSearch):
     """Without derivatives, from the middle and from the best so far."""
 
-    num_generations: int = eqx.field(static=True, default=100)
+    num_generations: int = eqx.field(static=True, default=200)
     population: int = eqx.field(static=True, default=24)
     scale: float = eqx.field(static=True, default=0.7)
     """How far about its start a search looks at first."""
