@@ -60,6 +60,7 @@ def test_a_pin_is_found_if_it_may_be_there():
                     "a": "door",
                     "b": "world",
                     "anchor_a": [0.45, 0.0],
+                    "anchor_b": [1 + 0.45 * np.cos(0.3), 2 + 0.45 * np.sin(0.3)],
                 }
             ],
         }
