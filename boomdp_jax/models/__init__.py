@@ -1,0 +1,31 @@
+"""Transition models that an agent can learn: regressions, ensembles, point fits."""
+
+from boomdp_jax.models.features import BodyFeatures as BodyFeatures
+from boomdp_jax.models.gaussian_process import GaussianProcess as GaussianProcess
+from boomdp_jax.models.linear import LinearRegression as LinearRegression
+from boomdp_jax.models.locally_weighted import LocallyWeighted as LocallyWeighted
+from boomdp_jax.models.model import AbstractModel as AbstractModel
+from boomdp_jax.models.neural_ensemble import NeuralEnsemble as NeuralEnsemble
+from boomdp_jax.models.object_oriented import ObjectOriented as ObjectOriented
+from boomdp_jax.models.outline_contact import touched_sectors as touched_sectors
+from boomdp_jax.models.point_fit import CmaEs as CmaEs
+from boomdp_jax.models.point_fit import GaussNewton as GaussNewton
+from boomdp_jax.models.point_fit import PointFit as PointFit
+from boomdp_jax.models.regression import AbstractRegressor as AbstractRegressor
+from boomdp_jax.models.regression import BodyRegression as BodyRegression
+
+__all__ = [
+    "AbstractModel",
+    "AbstractRegressor",
+    "BodyFeatures",
+    "BodyRegression",
+    "CmaEs",
+    "GaussNewton",
+    "GaussianProcess",
+    "LinearRegression",
+    "LocallyWeighted",
+    "NeuralEnsemble",
+    "ObjectOriented",
+    "PointFit",
+    "touched_sectors",
+]
