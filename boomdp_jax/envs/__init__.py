@@ -1,0 +1,31 @@
+"""Tasks: a scene, the true numbers, a reward and a goal."""
+
+from boomdp_jax.envs.acrobot import Acrobot as Acrobot
+from boomdp_jax.envs.action_set import ActionSet as ActionSet
+from boomdp_jax.envs.action_set import forces_round_circle as forces_round_circle
+from boomdp_jax.envs.action_set import join_actions as join_actions
+from boomdp_jax.envs.cart import Cart as Cart
+from boomdp_jax.envs.environment import AbstractEnvironment as AbstractEnvironment
+from boomdp_jax.envs.environment import EnvParams as EnvParams
+from boomdp_jax.envs.environment import EnvState as EnvState
+from boomdp_jax.envs.environment import PlanningHints as PlanningHints
+from boomdp_jax.envs.pendulum import Pendulum as Pendulum
+from boomdp_jax.envs.walls import Walls as Walls
+from boomdp_jax.envs.walls import stopped_at_walls as stopped_at_walls
+from boomdp_jax.envs.walls import walls_between as walls_between
+
+__all__ = [
+    "AbstractEnvironment",
+    "Acrobot",
+    "ActionSet",
+    "Cart",
+    "EnvParams",
+    "EnvState",
+    "Pendulum",
+    "PlanningHints",
+    "Walls",
+    "forces_round_circle",
+    "join_actions",
+    "stopped_at_walls",
+    "walls_between",
+]

@@ -1,0 +1,169 @@
+"""A shopping cart on fixed wheels, in a room whose middle wall hides the goal.
+
+After Scholz et al. (2014), A Physics-Based Model Prior for Object-Oriented MDPs, with
+the room, the cart and its way measured from their pictures, a pixel being a centimetre:
+the straight way is 3.5 m, the way round the wall about twice that. Both fixed wheels at
+the handle act as one contact, which rolls along the cart and hardly slips across it.
+Forces push the centre of mass; walls stop the cart (`walls`). The episode is solved,
+and costs nothing any more, within `GOAL_RADIUS` of the goal.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from boomdp_jax.core.arrays import BoolScalar, FloatScalar, Key
+from boomdp_jax.envs.action_set import forces_round_circle
+from boomdp_jax.envs.environment import (
+    AbstractEnvironment,
+    EnvParams,
+    PlanningHints,
+    distance,
+    uniform_near,
+    wrapped,
+)
+from boomdp_jax.envs.walls import (
+    outline_of,
+    stopped_at_walls,
+    wall_separation,
+    walls_between,
+)
+from boomdp_jax.physics.params import Params
+from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
+from boomdp_jax.physics.state import State
+from boomdp_jax.physics.step import step
+
+CART_OUTLINE = ((-0.65, -0.385), (0.66, -0.29), (0.66, 0.29), (-0.65, 0.385))
+"""Corners [m]: the handle's end is the wider one."""
+ROOM = (
+    (-1.0, -1.0, 0.06, 5.8),
+    (6.34, -1.0, 7.4, 5.8),
+    (-1.0, -1.0, 7.4, 0.06),
+    (-1.0, 4.74, 7.4, 5.8),
+    (3.13, 0.0, 3.26, 2.88),
+    (3.13, 4.32, 3.26, 4.79),
+    (0.0, 2.35, 0.64, 2.45),
+    (2.56, 2.35, 3.84, 2.45),
+    (5.76, 2.35, 6.4, 2.45),
+)
+"""Walls: least x and y, greatest x and y [m]."""
+START, GOAL, GOAL_RADIUS = (1.75, 1.34, 0.4), (5.28, 1.38), 0.3
+DENSITY, FORCE = 10.0, 30.0
+AXLE, VISCOUS = -0.5, (30.0, 600.0)
+"""Place of the wheels along the cart [m]; force per speed, rolling and across."""
+_TIME_STEP, _NUM_STEPS, _LEAF_STEPS = 0.4, 500, 10.0
+_NEAR_WALL = 0.16
+"""A cart this near a wall may have been stopped by it: stops come a quarter of a step's
+way early [m]."""
+
+
+def cart_scene(*, is_known: bool) -> SceneSpec:
+    """The cart's scene; unknown: its density, and pins and wheels that it may have."""
+    wheel = {"type": "wheel", "a": "cart", "pose": [AXLE, 0.0, 0.0]}
+    known = {"constraints": [{**wheel, "viscous": list(VISCOUS)}]}
+    return scene_spec_from_dict(
+        {
+            "schema": "planar-scene-1",
+            "gravity": [0.0, 0.0],
+            "dt": _TIME_STEP,
+            "bodies": [
+                {
+                    "name": "cart",
+                    "pose": list(START),
+                    "shape": {
+                        "type": "polygon",
+                        "vertices": np.array(CART_OUTLINE).tolist(),
+                    },
+                    "density": DENSITY if is_known else None,
+                }
+            ],
+            **(known if is_known else {"unknown": {"revolute": 1, "wheel": 1}}),
+        },
+        "cart",
+    )
+
+
+class Cart(AbstractEnvironment):
+    """Push a cart round a wall; `start_spread`: of its pose."""
+
+    def __init__(self, *, num_steps: int = _NUM_STEPS):
+        """Pose the task for so many steps an episode."""
+        self.name = "cart"
+        self.spec = cart_scene(is_known=False)
+        self.actions = forces_round_circle(1, 0, FORCE, 8, with_nothing=False)
+        self.num_steps = num_steps
+        self.hints = PlanningHints(
+            cell_size=(0.25, 0.25, 0.8),
+            stratum_size=(1.0, 1.0, np.inf),
+            depth=14,
+            action_repeat=2,
+            capacity=16,
+        )
+        self.walls = walls_between(np.array(ROOM))
+        # The engine's outline: about the centre of mass.
+        self.outline = outline_of(np.asarray(self.spec.scene.vertices[0], float))
+
+    def default_params(self) -> EnvParams:
+        """Starts within a quarter of a metre and in any direction."""
+        return EnvParams(
+            physics=cart_scene(is_known=True).params(),
+            goal=jnp.array([[*GOAL, 0.0]], float),
+            start=jnp.array([START], float),
+            start_spread=jnp.array([[0.2, 0.2, jnp.pi]], float),
+        )
+
+    def start(self, key: Key, params: EnvParams) -> State:
+        """Draw a pose, at rest; moved to the middle as far as walls are in the way."""
+        middle = params.start[0]
+        pose = uniform_near(key, middle, params.start_spread[0])
+        parts = jnp.linspace(1.0, 0.0, 6)
+        poses = (
+            pose.at[:2].set(middle[:2])[None]
+            + parts[:, None] * ((pose - pose.at[:2].set(middle[:2]))[None])
+        )
+        is_clear = jax.vmap(lambda p: wall_separation(self.walls, self.outline, p) > 0)(
+            poses
+        )
+        return State(poses[jnp.argmax(is_clear)][None], jnp.zeros((1, 3), pose.dtype))
+
+    def advance(
+        self, physics: Params, state: State, wrench: Float[Array, "body 3"]
+    ) -> State:
+        """One step of the engine, or as far as walls let the cart go."""
+        with jax.ensure_compile_time_eval():
+            scene = self.spec.scene
+        moved, _ = step(scene, physics, state, wrench)
+        return stopped_at_walls(self.walls, self.outline, state, moved)
+
+    def reward(
+        self,
+        state: State,
+        wrench: Float[Array, "body 3"],
+        next_state: State,
+        goal: Float[Array, "body 3"],
+    ) -> FloatScalar:
+        """Minus the distance to the goal [m], nothing once it is reached."""
+        away = distance(next_state.pose[0, :2], goal[0, :2])
+        return jnp.where(away < GOAL_RADIUS, 0.0, -away)
+
+    def is_solved(self, state: State, goal: Float[Array, "body 3"]) -> BoolScalar:
+        """Within the goal's radius."""
+        return distance(state.pose[0, :2], goal[0, :2]) < GOAL_RADIUS
+
+    def leaf_value(self, state: State, goal: Float[Array, "body 3"]) -> FloatScalar:
+        """The straight distance for ten steps more, as if there were no walls."""
+        return -_LEAF_STEPS * distance(state.pose[0, :2], goal[0, :2])
+
+    def coordinates(self, state: State) -> Float[Array, " coordinate"]:
+        """The pose: velocities fade within a step."""
+        return state.pose[0].at[2].set(wrapped(state.pose[0, 2]))
+
+    def observe(self, state: State) -> Float[Array, " number"]:
+        """Pose and twist."""
+        return jnp.concatenate([state.pose[0], state.twist[0]])
+
+    def moved_freely(self, state: State, next_state: State) -> Bool[Array, " body"]:
+        """Whether the cart was well clear of walls after the step."""
+        gap = wall_separation(self.walls, self.outline, next_state.pose[0])
+        return (gap > _NEAR_WALL)[None]
