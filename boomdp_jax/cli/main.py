@@ -15,6 +15,13 @@ LIKELIHOODS = ("auto", "filtered", "one-step", "open-loop")
 """Likelihoods of readings that exist."""
 
 
+TASKS = ("pendulum", "cart", "acrobot")
+"""Tasks of `run`."""
+
+AGENTS = ("true", "physics", "lr", "lwr", "gp", "ensemble", "random")
+"""Agents of `run`."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
 
@@ -60,6 +67,7 @@ def _make_parser() -> argparse.ArgumentParser:
     _add_infer(commands.add_parser("infer", help="from recordings to a posterior"))
     _add_predict(commands.add_parser("predict", help="held-out error and coverage"))
     _add_simulate(commands.add_parser("simulate", help="from wrenches to a recording"))
+    _add_run(commands.add_parser("run", help="an agent learns a task, over seeds"))
     _add_view(commands.add_parser("view", help="from a recording to a moving picture"))
     return parser
 
@@ -135,6 +143,29 @@ def _add_simulate(parser: argparse.ArgumentParser) -> None:
         help="standard deviation of readings [m, rad, m/s, rad/s]",
     )
     add("--seed", type=_whole(0, 2**32 - 1), default=0)
+
+
+def _add_run(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("task", choices=TASKS)
+    add("--agent", choices=AGENTS, required=True)
+    add("--seeds", type=_whole(1), default=20, metavar="N", help="episodes: 0 to N - 1")
+    add("--steps", type=_whole(1), metavar="T", help="of each; default: the task's")
+    add(
+        "--out",
+        required=True,
+        metavar="DIR",
+        help="each episode is written there as it is done; the same command goes on"
+        " where the folder stands",
+    )
+    add("--shard", type=_shard, metavar="I/N", help="do seeds I, I + N... only")
+    add(
+        "--noise",
+        nargs=4,
+        type=_scale,
+        metavar=("SX", "STHETA", "SV", "SOMEGA"),
+        help="standard deviation of the readings that are learnt from",
+    )
 
 
 def _add_view(parser: argparse.ArgumentParser) -> None:

@@ -70,8 +70,8 @@ def assemble_posterior(
         prior_noise_parts.append(reading)
         prior_impulse_parts.append(impulse)
     blocks = [r.block for r in results]
-    params, inferred = _merge(spec, blocks, posterior_parts)
-    prior_params, _ = _merge(spec, blocks, prior_parts)
+    params, inferred = merge_params(spec, blocks, posterior_parts)
+    prior_params, _ = merge_params(spec, blocks, prior_parts)
     rng = host_generator(jax.random.fold_in(key, len(results)))
     params = with_contact_numbers(rng, spec, blocks, posterior_parts, params)
     prior_params = with_contact_numbers(rng, spec, blocks, prior_parts, prior_params)
@@ -118,10 +118,19 @@ def _prior_coordinates(rng: np.random.Generator, target) -> np.ndarray:
     return z.astype(target.log_prior.dtype)
 
 
-def _merge(
+def merge_params(
     spec: SceneSpec, blocks: list[Block], parts: list[Params]
 ) -> tuple[Params, dict[str, np.ndarray]]:
-    """Params of the scene from those of its blocks, and which slots are inferred."""
+    """Params of the scene from those of its blocks, and which slots are inferred.
+
+    Args:
+        spec: the scene.
+        blocks: its independent blocks.
+        parts: Φ of each, all with the same leading axis `draw`.
+
+    Returns:
+        Φ of the scene, leading axis `draw`; by kind, a mask of its inferred slots.
+    """
     num_draws = parts[0].density.shape[0] if parts else 1
     num_joints = {
         kind: sum(block.layout.count(kind) for block in blocks) for kind in JOINTS

@@ -23,10 +23,11 @@ from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import BoolScalar, Key, on_device
 from boomdp_jax.core.history import History, make_history
+from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.compile_ahead import signature
 from boomdp_jax.inference.components import independent_blocks
 from boomdp_jax.inference.infer import check_history
-from boomdp_jax.inference.online_posterior import online_posterior
+from boomdp_jax.inference.online_posterior import online_params, online_posterior
 from boomdp_jax.inference.online_refit import (
     BlockRefit,
     RefitSettings,
@@ -37,6 +38,7 @@ from boomdp_jax.inference.online_refit import (
 from boomdp_jax.inference.online_refresh import LEAVING_SHARE, OnlineInfo, refresh
 from boomdp_jax.inference.online_state import BeliefState, BlockBelief
 from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene_spec import SceneSpec
 from boomdp_jax.physics.state import State
 
@@ -149,12 +151,11 @@ class OnlineBelief:
         self._empty = eqx.tree_at(
             lambda h: h.dt, history, on_device(np.full(capacity, self._dt))
         )
-        check_history(spec, self._empty if screen is None else screen)
+        seen = self._empty if screen is None else screen
+        check_history(spec, seen)
         self._blocks = [
             make_online_block(self._settings, bodies, self._empty)
-            for bodies in independent_blocks(
-                spec, self._empty if screen is None else screen
-            )[0]
+            for bodies in independent_blocks(spec, seen)[0]
         ]
         groups: dict[object, list[int]] = {}
         for index, block in enumerate(self._blocks):
@@ -334,17 +335,32 @@ class OnlineBelief:
         return belief, RefitInfo(tuple(found), time.perf_counter() - start)
 
     def posterior(self, belief: BeliefState) -> Posterior:
-        """The belief as weighted draws, as `infer` gives them.
+        """Weighted draws: particles of one block, those of several paired at random."""
+        key = jax.random.fold_in(belief.key, 1)
+        return online_posterior(key, self.spec, self._parts(belief))
 
-        With one block the draws are its particles with their weights; with several,
-        each block's particles are resampled and paired at random.
+    def sample_params(self, key: Key, belief: BeliefState, num_samples: int) -> Params:
+        """Draw hypotheses, for a planner between two steps; on the host.
+
+        Args:
+            key: random key.
+            belief: so far.
+            num_samples: how many, at least one.
+
+        Returns:
+            Φ, of equal weight, drawn systematically; leading axis `num_samples`.
         """
-        parts = [
+        if num_samples < 1:
+            raise ValueError(f"num_samples: expected at least 1, got {num_samples}")
+        return online_params(key, self.spec, self._parts(belief), num_samples)
+
+    def _parts(self, belief: BeliefState) -> list[tuple[Block, BlockBelief]]:
+        """Blocks, and what is believed of each."""
+        return [
             (self._blocks[index], jax.tree.map(lambda leaf, i=place: leaf[i], stacked))
             for group, stacked in zip(self._groups, belief.blocks, strict=True)
             for place, index in enumerate(group)
         ]
-        return online_posterior(jax.random.fold_in(belief.key, 1), self.spec, parts)
 
     def _stacked(self, beliefs: dict[int, BlockBelief]) -> tuple[BlockBelief, ...]:
         """Blocks of equal shapes side by side."""

@@ -7,9 +7,11 @@ import jax
 import numpy as np
 
 from boomdp_jax.core.arrays import Key, on_device
-from boomdp_jax.inference.assemble import assemble_posterior
+from boomdp_jax.inference.assemble import assemble_posterior, merge_params
 from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics
+from boomdp_jax.inference.contact_numbers import with_contact_numbers
+from boomdp_jax.inference.decode import decode
 from boomdp_jax.inference.evidence_report import BlockResult
 from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.one_step import NOISE_SHAPE
@@ -18,6 +20,7 @@ from boomdp_jax.inference.online_state import BlockBelief
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.resampling import systematic
 from boomdp_jax.inference.sample import BlockDraws
+from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 # Fewer particles in effect than this share are reason for doubt.
@@ -56,6 +59,35 @@ def online_posterior(
         return posterior
     weights = on_device(log_weight, posterior.log_weight.dtype)
     return dataclasses.replace(posterior, log_weight=weights)
+
+
+def online_params(
+    key: Key, spec: SceneSpec, parts: list[tuple[Block, BlockBelief]], num_draws: int
+) -> Params:
+    """Hypotheses drawn systematically from the particles, and nothing else.
+
+    Args:
+        key: random key.
+        spec: the scene.
+        parts: its blocks, and what is believed of each.
+        num_draws: how many hypotheses.
+
+    Returns:
+        Φ, leading axis `num_draws`; in random order.
+    """
+    rng = host_generator(key)
+    blocks, decoded = [], []
+    for block, belief in parts:
+        target, particles = belief.target, belief.particles
+        likelihood: Any = target.log_likelihood
+        weight = np.exp(np.asarray(particles.log_weight, float))
+        rows = rng.permutation(systematic(rng, weight, num_draws))
+        active = np.asarray(target.structures)[np.asarray(particles.structure)[rows]]
+        z = np.asarray(particles.z)[rows]
+        blocks.append(block._replace(target=target))
+        decoded.append(decode(likelihood.coordinates, z, active, num_draws))
+    params, _ = merge_params(spec, blocks, decoded)
+    return with_contact_numbers(rng, spec, blocks, decoded, params)
 
 
 def _result(

@@ -1,4 +1,4 @@
-"""Transition models that an agent can learn: regressions, ensembles, point fits."""
+"""Transition models that an agent can learn: physics, regressions, point fits."""
 
 from boomdp_jax.models.features import BodyFeatures as BodyFeatures
 from boomdp_jax.models.gaussian_process import GaussianProcess as GaussianProcess
@@ -8,11 +8,13 @@ from boomdp_jax.models.model import AbstractModel as AbstractModel
 from boomdp_jax.models.neural_ensemble import NeuralEnsemble as NeuralEnsemble
 from boomdp_jax.models.object_oriented import ObjectOriented as ObjectOriented
 from boomdp_jax.models.outline_contact import touched_sectors as touched_sectors
+from boomdp_jax.models.physics_model import PhysicsModel as PhysicsModel
 from boomdp_jax.models.point_fit import CmaEs as CmaEs
 from boomdp_jax.models.point_fit import GaussNewton as GaussNewton
 from boomdp_jax.models.point_fit import PointFit as PointFit
 from boomdp_jax.models.regression import AbstractRegressor as AbstractRegressor
 from boomdp_jax.models.regression import BodyRegression as BodyRegression
+from boomdp_jax.models.true_model import TrueModel as TrueModel
 
 __all__ = [
     "AbstractModel",
@@ -26,6 +28,8 @@ __all__ = [
     "LocallyWeighted",
     "NeuralEnsemble",
     "ObjectOriented",
+    "PhysicsModel",
     "PointFit",
+    "TrueModel",
     "touched_sectors",
 ]

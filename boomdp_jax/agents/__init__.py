@@ -1,0 +1,9 @@
+"""Agents: a model, a planner and exploration, closed around a task."""
+
+from boomdp_jax.agents.agent import Agent as Agent
+from boomdp_jax.agents.agent import make_agent as make_agent
+from boomdp_jax.agents.agent import random_agent as random_agent
+from boomdp_jax.agents.episode import EpisodeRecord as EpisodeRecord
+from boomdp_jax.agents.episode import run_episode as run_episode
+
+__all__ = ["Agent", "EpisodeRecord", "make_agent", "random_agent", "run_episode"]

@@ -1,0 +1,152 @@
+"""Many episodes of one agent on one task: written seed by seed, resumable.
+
+A folder holds `run.json` (what was begun: task, agent, steps, seeds, noise, versions),
+one `seed-00000.npz` for each episode that is done, written whole or not at all, and,
+once all are, `results.npz` with leading axis `seed`. Whoever begins the same run in the
+same folder goes on where it stands; rewards, actions and states come out to the same
+bits however often it was stopped and however many machines shared it.
+"""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from boomdp_jax.agents.episode import EpisodeRecord, run_episode
+from boomdp_jax.core.arrays import on_device
+from boomdp_jax.core.json_file import check_same, read_json, write_json
+from boomdp_jax.core.npz_file import read_npz, write_npz
+from boomdp_jax.experiments.registry import agent_of, make_task
+from boomdp_jax.inference.posterior import library_versions
+
+SCHEMA = "boomdp-run-1"
+"""Version of the folder's format."""
+
+
+class Run(NamedTuple):
+    """One agent on one task, over seeds."""
+
+    folder: Path
+    task: str
+    agent: str
+    num_seeds: int
+    num_steps: int
+    noise: tuple[float, float, float, float] | None
+    """Standard deviation of the readings that are learnt from."""
+
+    def path(self, seed: int) -> Path:
+        """File of one episode."""
+        return self.folder / f"seed-{seed:05d}.npz"
+
+    def missing(self, shard: tuple[int, int] = (0, 1)) -> list[int]:
+        """Seeds of a shard that have not been run yet.
+
+        Args:
+            shard: place and number of shards; a shard has every so-manieth seed.
+
+        Raises:
+            ValueError: no such shard.
+        """
+        place, num = shard
+        if not 0 <= place < num:
+            raise ValueError(f"shard: expected 0 <= place < number, got {place}/{num}")
+        seeds = range(place, self.num_seeds, num)
+        return [seed for seed in seeds if not self.path(seed).exists()]
+
+    def run_seeds(self, seeds: Sequence[int], report=None) -> None:
+        """Run some episodes and write each as it is done.
+
+        Args:
+            seeds: which.
+            report: called with seed and record of each.
+        """
+        task = make_task(self.task, self.num_steps)
+        params = task.default_params()
+        agent = agent_of(self.agent, task, params)
+        noise = None if self.noise is None else on_device(self.noise)
+        for seed in seeds:
+            record, _ = run_episode(
+                jax.random.key(seed), task, params, agent, reading_noise=noise
+            )
+            write_npz(self.path(seed), record._asdict())
+            if report is not None:
+                report(seed, record)
+
+    def collect(self) -> dict[str, np.ndarray] | None:
+        """Put all episodes together, if all are there.
+
+        Returns:
+            What `results.npz` then holds: the fields of `EpisodeRecord` with a leading
+            axis `seed`; None while episodes are missing.
+        """
+        if self.missing():
+            return None
+        records = [read_npz(self.path(seed)) for seed in range(self.num_seeds)]
+        results = {
+            field: np.stack([record[field] for record in records])
+            for field in EpisodeRecord._fields
+        }
+        write_npz(self.folder / "results.npz", results)
+        return results
+
+
+def begin_run(
+    task: str,
+    agent: str,
+    folder: str | os.PathLike,
+    *,
+    num_seeds: int,
+    num_steps: int | None = None,
+    noise: Sequence[float] | None = None,
+) -> Run:
+    """Begin a run in a folder, or take up one that was begun there.
+
+    Args:
+        task: name of a task.
+        agent: name of an agent.
+        folder: made if there is none.
+        num_seeds: episodes; their seeds are 0, 1, ...
+        num_steps: of each; default: the task's own.
+        noise: standard deviation of the readings that agents learn from: position [m],
+            angle [rad], velocity [m/s], spin [rad/s]; none: exact.
+
+    Returns:
+        The run.
+
+    Raises:
+        ValueError: an unknown name, a number out of range, or a folder in which
+            something else was begun; the message names the entry.
+        OSError: the folder cannot be written.
+    """
+    if num_seeds < 1:
+        raise ValueError(f"num_seeds: expected at least 1, got {num_seeds}")
+    made = make_task(task, num_steps)
+    agent_of("true" if agent == "physics" else agent, made, made.default_params())
+    scale = None
+    if noise is not None:
+        scale = tuple(float(number) for number in noise)
+        if len(scale) != 4 or not all(np.isfinite(s) and s >= 0 for s in scale):
+            raise ValueError(
+                "noise: expected four finite numbers of at least 0 (position, angle, "
+                f"velocity, spin), got {list(noise)}"
+            )
+    run = Run(Path(folder), task, agent, num_seeds, made.num_steps, scale)
+    run.folder.mkdir(parents=True, exist_ok=True)
+    content = {
+        "schema": SCHEMA,
+        "task": task,
+        "agent": agent,
+        "num_seeds": num_seeds,
+        "num_steps": made.num_steps,
+        "noise": None if scale is None else list(scale),
+        "versions": library_versions(),
+    }
+    path = run.folder / "run.json"
+    if path.exists():
+        check_same(path, read_json(path, SCHEMA), content)
+    else:
+        write_json(path, content)
+    return run
