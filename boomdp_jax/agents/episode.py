@@ -87,12 +87,11 @@ def run_episode(
     is_compiled = agent.model.is_compiled
     sample = _compiled_sample if is_compiled else _sample
     update = _compiled_update if is_compiled else _update
-    plan, index, num_left = None, 0, 0
-    belief = sample(agent.model, act_key, learnt, agent.num_hypotheses)
+    plan, belief, index, num_left = None, None, 0, 0
     for step in range(task.num_steps):
         if bool(now.is_terminal):
             break
-        if num_left == 0:
+        if num_left == 0 or belief is None:
             begin = time.perf_counter()
             belief_key, plan_key = jax.random.split(act_keys[step])
             belief = sample(agent.model, belief_key, learnt, agent.num_hypotheses)

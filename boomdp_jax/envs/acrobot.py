@@ -5,7 +5,6 @@ dynamics of two boxes and the height of the tip as the cost. Where returns on a 
 hardly separate models, those on an acrobot do (Ramesh and Ravindran 2023).
 """
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -106,9 +105,7 @@ class Acrobot(AbstractEnvironment):
         self, physics: Params, state: State, wrench: Float[Array, "body 3"]
     ) -> State:
         """One step of the engine."""
-        with jax.ensure_compile_time_eval():
-            scene = self.spec.scene
-        return step(scene, physics, state, wrench)[0]
+        return step(self.scene, physics, state, wrench)[0]
 
     def reward(
         self,

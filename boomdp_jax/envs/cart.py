@@ -128,11 +128,9 @@ class Cart(AbstractEnvironment):
         """Draw a pose, at rest; moved to the middle as far as walls are in the way."""
         middle = params.start[0]
         pose = uniform_near(key, middle, params.start_spread[0])
-        parts = jnp.linspace(1.0, 0.0, 6)
-        poses = (
-            pose.at[:2].set(middle[:2])[None]
-            + parts[:, None] * ((pose - pose.at[:2].set(middle[:2]))[None])
-        )
+        turned = pose.at[:2].set(middle[:2])
+        parts = jnp.linspace(1.0, 0.0, 6, dtype=pose.dtype)
+        poses = turned[None] + parts[:, None] * (pose - turned)[None]
         is_clear = jax.vmap(lambda p: wall_separation(self.walls, self.outline, p) > 0)(
             poses
         )
@@ -142,9 +140,7 @@ class Cart(AbstractEnvironment):
         self, physics: Params, state: State, wrench: Float[Array, "body 3"]
     ) -> State:
         """One step of the engine, or as far as walls let the cart go."""
-        with jax.ensure_compile_time_eval():
-            scene = self.spec.scene
-        moved, _ = step(scene, physics, state, wrench)
+        moved, _ = step(self.scene, physics, state, wrench)
         return stopped_at_walls(self.walls, self.outline, state, moved)
 
     def reward(

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar, Key
 from boomdp_jax.envs.action_set import ActionSet
 from boomdp_jax.physics.params import Params
+from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.scene_spec import SceneSpec
 from boomdp_jax.physics.state import State
 
@@ -90,7 +91,11 @@ class AbstractEnvironment(abc.ABC):
 
     @abc.abstractmethod
     def reward(
-        self, state: State, wrench: Float[Array, "body 3"], next_state: State, goal
+        self,
+        state: State,
+        wrench: Float[Array, "body 3"],
+        next_state: State,
+        goal: Float[Array, "body 3"],
     ) -> FloatScalar:
         """Of one step, at most 0; `goal` as in `EnvParams`."""
 
@@ -116,6 +121,12 @@ class AbstractEnvironment(abc.ABC):
 
         What is learnt of a body's own numbers should rest on such steps alone.
         """
+
+    @property
+    def scene(self) -> Scene:
+        """Arrays of `spec`, concrete even while something is traced."""
+        with jax.ensure_compile_time_eval():
+            return self.spec.scene
 
     @property
     def num_actions(self) -> int:

@@ -5,7 +5,6 @@ unit circle on the bob, chosen too weak for a direct swing-up; the reward is min
 angle from upright in radians; a learner without physics sees x, y and their rates.
 """
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -17,7 +16,6 @@ from boomdp_jax.envs.environment import (
     EnvParams,
     PlanningHints,
     uniform_near,
-    wrapped,
 )
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
@@ -103,11 +101,7 @@ class Pendulum(AbstractEnvironment):
         self, physics: Params, state: State, wrench: Float[Array, "body 3"]
     ) -> State:
         """One step of the engine."""
-        return step(self._scene(), physics, state, wrench)[0]
-
-    def _scene(self):
-        with jax.ensure_compile_time_eval():
-            return self.spec.scene
+        return step(self.scene, physics, state, wrench)[0]
 
     def reward(
         self,
@@ -117,7 +111,7 @@ class Pendulum(AbstractEnvironment):
         goal: Float[Array, "body 3"],
     ) -> FloatScalar:
         """Minus the angle from upright [rad], by where the bob is seen."""
-        return -_from_upright(next_state)
+        return -angle_from_upright(next_state)
 
     def is_solved(self, state: State, goal: Float[Array, "body 3"]) -> BoolScalar:
         """Never: upright has to be kept."""
@@ -125,7 +119,7 @@ class Pendulum(AbstractEnvironment):
 
     def leaf_value(self, state: State, goal: Float[Array, "body 3"]) -> FloatScalar:
         """As if the bob stayed for ten steps."""
-        return -_LEAF_STEPS * _from_upright(state)
+        return -_LEAF_STEPS * angle_from_upright(state)
 
     def coordinates(self, state: State) -> Float[Array, " coordinate"]:
         """Angle and spin about the pivot at the origin, by place and velocity."""
@@ -143,11 +137,7 @@ class Pendulum(AbstractEnvironment):
         return jnp.ones(1, bool)
 
 
-def _from_upright(state: State) -> FloatScalar:
+def angle_from_upright(state: State) -> FloatScalar:
+    """How far the bob is from upright [rad], by its place about the pivot."""
     x, y = state.pose[0, 0], state.pose[0, 1]
     return jnp.abs(jnp.arctan2(x, y))
-
-
-def angle_from_upright(state: State) -> FloatScalar:
-    """How far the bob is from upright [rad]."""
-    return jnp.abs(wrapped(_from_upright(state)))

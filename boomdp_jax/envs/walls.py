@@ -14,7 +14,11 @@ and rebound): some hundred times faster than contacts with a whole room, which m
 where ten thousand steps are tried a decision.
 """
 
+import functools
+from collections.abc import Callable, Sequence
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -85,20 +89,57 @@ def wall_separation(
         The least over walls.
     """
     dtype = pose.dtype
-    middle, half = walls.middle.astype(dtype), walls.half_extents.astype(dtype)
-    c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
-    turn = jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
-    vertices = outline.vertices.astype(dtype) @ turn.T
-    normals = outline.normals.astype(dtype) @ turn.T
-    away = middle - pose[None, :2]
-    # Along the axes of the world: the wall's faces.
-    above = away - half - jnp.max(vertices, axis=0)[None]
-    below = -away - half + jnp.min(vertices, axis=0)[None]
-    by_wall = jnp.max(jnp.maximum(above, below), axis=1)
-    # Along the outline's own normals.
-    gaps = away @ normals.T - half @ jnp.abs(normals).T
-    by_edge = jnp.max(gaps - outline.offsets.astype(dtype)[None], axis=1)
-    return jnp.min(jnp.maximum(by_wall, by_edge))
+    # Scalars, written out: of small arrays in a batch the compiler makes loops of a few
+    # rounds each, which took twenty times as long.
+    cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
+    vertices = _turned(outline.vertices.astype(dtype), cos, sin)
+    normals = _turned(outline.normals.astype(dtype), cos, sin)
+    extents = [
+        (_best(v, jnp.minimum), _best(v, jnp.maximum))
+        for v in zip(*vertices, strict=True)
+    ]
+    gaps = []
+    for middle, half in zip(
+        walls.middle.astype(dtype), walls.half_extents.astype(dtype), strict=True
+    ):
+        away = middle[0] - pose[0], middle[1] - pose[1]
+        # Along the axes of the world: the wall's faces.
+        along = [
+            gap
+            for axis, (low, high) in enumerate(extents)
+            for gap in (
+                away[axis] - half[axis] - high,
+                low - away[axis] - half[axis],
+            )
+        ]
+        # Along the outline's own normals.
+        along += [
+            x * away[0]
+            + y * away[1]
+            - jnp.abs(x) * half[0]
+            - jnp.abs(y) * half[1]
+            - offset
+            for (x, y), offset in zip(
+                normals, outline.offsets.astype(dtype), strict=True
+            )
+        ]
+        gaps.append(_best(along, jnp.maximum))
+    return _best(gaps, jnp.minimum)
+
+
+def _turned(
+    vectors: Float[Array, "vertex 2"], cos: FloatScalar, sin: FloatScalar
+) -> list[tuple[FloatScalar, FloatScalar]]:
+    """Into the world frame, as scalars."""
+    return [(cos * x - sin * y, sin * x + cos * y) for x, y in vectors]
+
+
+def _best(
+    numbers: Sequence[FloatScalar],
+    better: Callable[[FloatScalar, FloatScalar], FloatScalar],
+) -> FloatScalar:
+    """The best of some scalars, such as the least by `jnp.minimum`."""
+    return functools.reduce(better, numbers)
 
 
 def touches(walls: Walls, outline: Outline, pose: Float[Array, "3"]) -> BoolScalar:
@@ -122,12 +163,16 @@ def stopped_at_walls(
     """
     before, after = state.pose[0], next_state.pose[0]
     parts = jnp.arange(1, _NUM_CHECKS + 1, dtype=before.dtype) / _NUM_CHECKS
-    is_clear = jnp.ones((), bool)
-    reached = jnp.zeros((), before.dtype)
-    for part in parts:
+
+    # A loop, since all checks at once are more than the compiler keeps as one function.
+    def check(carry, part):
+        is_clear, reached = carry
         pose = before + part * (after - before)
         is_clear = is_clear & ~touches(walls, outline, pose)
-        reached = jnp.where(is_clear, part, reached)
+        return (is_clear, jnp.where(is_clear, part, reached)), None
+
+    begun = jnp.ones((), bool), jnp.zeros((), before.dtype)
+    (is_clear, reached), _ = jax.lax.scan(check, begun, parts)
     pose = jnp.where(is_clear, after, before + reached * (after - before))
     twist = jnp.where(is_clear, next_state.twist, 0.0)
     return State(pose[None], twist)

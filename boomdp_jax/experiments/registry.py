@@ -91,6 +91,16 @@ def make_task(name: str, num_steps: int | None = None) -> AbstractEnvironment:
     return TASKS[name](num_steps=num_steps)
 
 
+def check_agent(name: str) -> None:
+    """Refuse a name that is no agent's.
+
+    Raises:
+        ValueError: it is none of `AGENTS`.
+    """
+    if name not in AGENTS:
+        raise ValueError(f"agent: expected one of {', '.join(AGENTS)}; got {name!r}")
+
+
 def agent_of(name: str, task: AbstractEnvironment, params: EnvParams) -> Agent:
     """An agent by its name, for a task.
 
@@ -105,8 +115,7 @@ def agent_of(name: str, task: AbstractEnvironment, params: EnvParams) -> Agent:
     Raises:
         ValueError: no such agent.
     """
-    if name not in AGENTS:
-        raise ValueError(f"agent: expected one of {', '.join(AGENTS)}; got {name!r}")
+    check_agent(name)
     if name == "random":
         return random_agent(_true(task, params), task.hints.action_repeat)
     build, num_hypotheses = _MODELS[name]

@@ -8,7 +8,7 @@ bits however often it was stopped and however many machines shared it.
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +19,7 @@ from boomdp_jax.agents.episode import EpisodeRecord, run_episode
 from boomdp_jax.core.arrays import on_device
 from boomdp_jax.core.json_file import check_same, read_json, write_json
 from boomdp_jax.core.npz_file import read_npz, write_npz
-from boomdp_jax.experiments.registry import agent_of, make_task
+from boomdp_jax.experiments.registry import agent_of, check_agent, make_task
 from boomdp_jax.inference.posterior import library_versions
 
 SCHEMA = "boomdp-run-1"
@@ -45,7 +45,7 @@ class Run(NamedTuple):
         """Seeds of a shard that have not been run yet.
 
         Args:
-            shard: place and number of shards; a shard has every so-manieth seed.
+            shard: place i and number n of shards; a shard has seeds i, i + n and so on.
 
         Raises:
             ValueError: no such shard.
@@ -56,7 +56,11 @@ class Run(NamedTuple):
         seeds = range(place, self.num_seeds, num)
         return [seed for seed in seeds if not self.path(seed).exists()]
 
-    def run_seeds(self, seeds: Sequence[int], report=None) -> None:
+    def run_seeds(
+        self,
+        seeds: Sequence[int],
+        report: Callable[[int, EpisodeRecord], None] | None = None,
+    ) -> None:
         """Run some episodes and write each as it is done.
 
         Args:
@@ -124,7 +128,7 @@ def begin_run(
     if num_seeds < 1:
         raise ValueError(f"num_seeds: expected at least 1, got {num_seeds}")
     made = make_task(task, num_steps)
-    agent_of("true" if agent == "physics" else agent, made, made.default_params())
+    check_agent(agent)
     scale = None
     if noise is not None:
         scale = tuple(float(number) for number in noise)

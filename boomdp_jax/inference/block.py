@@ -83,7 +83,7 @@ def make_block(
         surroundings=surroundings(
             spec, bodies, layout, poses, _forces(history, bodies)
         ),
-        scene=_block_scene(spec.scene, bodies),
+        scene=_block_scene(spec.scene, bodies, np.asarray(history.dt)),
         contact=contact,
     )
     if is_uniform is None:
@@ -141,10 +141,11 @@ def _forces(history: History, bodies: tuple[int, ...]) -> np.ndarray:
     return np.asarray(history.action, float)[rows][:, list(bodies), :2]
 
 
-def _block_scene(scene: Scene, bodies: tuple[int, ...]) -> Scene:
+def _block_scene(scene: Scene, bodies: tuple[int, ...], dt: np.ndarray) -> Scene:
     """The scene of a block's bodies; outlines shrink to a point: see `contact`."""
     index = np.asarray(bodies)
-    is_short = float(np.max(np.asarray(scene.dt))) <= _LONGEST_WHOLE_STEP
+    # Of all rows, unused ones too: an online table holds its length from the start.
+    longest = float(np.max(dt)) if dt.size else float(scene.dt)
 
     def pick(array):
         picked = np.asarray(array)[index]
@@ -162,7 +163,7 @@ def _block_scene(scene: Scene, bodies: tuple[int, ...]) -> Scene:
         gravity=scene.gravity,
         normal_gravity=scene.normal_gravity,
         dt=scene.dt,
-        num_substeps=1 if is_short else scene.num_substeps,
+        num_substeps=1 if longest <= _LONGEST_WHOLE_STEP else scene.num_substeps,
     )
 
 

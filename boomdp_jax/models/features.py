@@ -12,12 +12,12 @@ dropped, so that what was learnt in one place holds in all.
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import FloatScalar
+from boomdp_jax.envs.environment import wrapped
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
 
@@ -101,7 +101,7 @@ class BodyFeatures(eqx.Module):
         pose, twist = state.pose[index], state.twist[index]
         parts = [self._local(pose, twist), self._local(pose, wrench[index])]
         if self.frame == "world":
-            parts.insert(0, pose.at[:, 2].set(_wrapped(pose[:, 2])))
+            parts.insert(0, pose.at[:, 2].set(wrapped(pose[:, 2])))
         return jnp.concatenate([self._chosen(part) for part in parts], axis=-1)
 
     def targets(self, state: State, next_state: State) -> Float[Array, "moving output"]:
@@ -117,10 +117,33 @@ class BodyFeatures(eqx.Module):
         index = np.array(self.moving)
         pose, twist = state.pose[index], state.twist[index]
         shift = next_state.pose[index] - pose
-        shift = shift.at[:, 2].set(_wrapped(shift[:, 2])) - self.dt * twist
+        shift = shift.at[:, 2].set(wrapped(shift[:, 2])) - self.dt * twist
         change = next_state.twist[index] - twist
         parts = [self._local(pose, shift), self._local(pose, change)]
         return jnp.concatenate([self._chosen(part) for part in parts], axis=-1)
+
+    def row(
+        self, state: State, wrench: Float[Array, "body 3"], next_state: State
+    ) -> tuple[
+        Float[Array, "moving input"],
+        Float[Array, "moving output"],
+        Bool[Array, " moving"],
+    ]:
+        """What a regression learns from a step.
+
+        Args:
+            state: before it.
+            wrench: held over it [N, N, N m].
+            next_state: after it; not a number where it was not read.
+
+        Returns:
+            Inputs and targets, zero where they were not read, and of which moving
+            bodies all of them were.
+        """
+        inputs, targets = self.inputs(state, wrench), self.targets(state, next_state)
+        both = jnp.concatenate([inputs, targets], axis=-1)
+        is_seen = jnp.all(jnp.isfinite(both), axis=-1)
+        return jnp.nan_to_num(inputs), jnp.nan_to_num(targets), is_seen
 
     def next_state(self, state: State, outputs: Float[Array, "moving output"]) -> State:
         """Where bodies are after a step for which a regression says this.
@@ -176,17 +199,3 @@ class BodyFeatures(eqx.Module):
     def _filled(self, vector: Float[Array, "moving number"]) -> Array:
         """With a zero for the angular number that does not count."""
         return vector if self.has_angles else jnp.pad(vector, ((0, 0), (0, 1)))
-
-
-def _wrapped(angle: Float[Array, " moving"]) -> Float[Array, " moving"]:
-    """The same direction, between −π and π."""
-    return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
-
-
-def is_complete(
-    inputs: Float[Array, "moving input"], targets: Float[Array, "moving output"]
-) -> jax.Array:
-    """Of which bodies every number was read."""
-    return jnp.all(jnp.isfinite(inputs), axis=-1) & jnp.all(
-        jnp.isfinite(targets), axis=-1
-    )

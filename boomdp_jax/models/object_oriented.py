@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from boomdp_jax.core.arrays import BoolScalar, Key
-from boomdp_jax.models.features import BodyFeatures, is_complete
+from boomdp_jax.models.features import BodyFeatures
 from boomdp_jax.models.locally_weighted import (
     LocalFit,
     LocallyWeighted,
@@ -24,6 +24,7 @@ from boomdp_jax.models.locally_weighted import (
 )
 from boomdp_jax.models.model import AbstractModel
 from boomdp_jax.models.outline_contact import condition_number, touched_sectors
+from boomdp_jax.models.regression import add_and_tune, fit_to_nothing
 from boomdp_jax.models.table import check_at_least
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
@@ -109,11 +110,7 @@ class ObjectOriented(AbstractModel):
 
     def init(self, key: Key) -> LocalFit:
         """A fit to nothing for each moving body."""
-        num_inputs, num_outputs = self.features.num_inputs, self.features.num_outputs
-        keys = jax.random.split(key, len(self.features.moving))
-        return jax.vmap(lambda one: self.regressor.init(one, num_inputs, num_outputs))(
-            keys
-        )
+        return fit_to_nothing(key, self.features, self.regressor)
 
     def update(
         self,
@@ -126,20 +123,8 @@ class ObjectOriented(AbstractModel):
     ) -> LocalFit:
         """Take one transition in, each body under its condition before the step."""
         del starts_episode  # Rows stand for themselves.
-        inputs = self.features.inputs(state, wrench)
-        targets = self.features.targets(state, next_state)
-        is_seen = is_complete(inputs, targets)
-        learnt = jax.vmap(self.regressor.add)(
-            learnt,
-            jnp.nan_to_num(inputs),
-            jnp.nan_to_num(targets),
-            is_seen,
-            self.conditions(state),
-        )
-        is_due = jnp.any(jax.vmap(self.regressor.is_due)(learnt))
-        return jax.lax.cond(
-            is_due, jax.vmap(self.regressor.tune), lambda same: same, learnt
-        )
+        row = self.features.row(state, wrench, next_state)
+        return add_and_tune(self.regressor, learnt, *row, self.conditions(state))
 
     def sample(self, key: Key, learnt: LocalFit, num_hypotheses: int) -> Belief:
         """The one hypothesis."""

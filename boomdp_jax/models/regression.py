@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from boomdp_jax.core.arrays import BoolScalar, Key
-from boomdp_jax.models.features import BodyFeatures, is_complete
+from boomdp_jax.models.features import BodyFeatures
 from boomdp_jax.models.model import AbstractModel
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
@@ -102,11 +102,7 @@ class BodyRegression(AbstractModel):
 
     def init(self, key: Key) -> PyTree:
         """A fit to nothing for each moving body."""
-        num_inputs, num_outputs = self.features.num_inputs, self.features.num_outputs
-        keys = jax.random.split(key, len(self.features.moving))
-        return jax.vmap(lambda one: self.regressor.init(one, num_inputs, num_outputs))(
-            keys
-        )
+        return fit_to_nothing(key, self.features, self.regressor)
 
     def update(
         self,
@@ -119,16 +115,8 @@ class BodyRegression(AbstractModel):
     ) -> PyTree:
         """Take one transition in; bodies of which a number is missing learn nothing."""
         del starts_episode  # Rows stand for themselves.
-        inputs = self.features.inputs(state, wrench)
-        targets = self.features.targets(state, next_state)
-        is_seen = is_complete(inputs, targets)
-        learnt = jax.vmap(self.regressor.add)(
-            learnt, jnp.nan_to_num(inputs), jnp.nan_to_num(targets), is_seen
-        )
-        is_due = jnp.any(jax.vmap(self.regressor.is_due)(learnt))
-        return jax.lax.cond(
-            is_due, jax.vmap(self.regressor.tune), lambda same: same, learnt
-        )
+        row = self.features.row(state, wrench, next_state)
+        return add_and_tune(self.regressor, learnt, *row)
 
     def sample(self, key: Key, learnt: PyTree, num_hypotheses: int) -> Belief:
         """The regressor's hypotheses, at most so many of them, drawn evenly."""
@@ -149,3 +137,37 @@ class BodyRegression(AbstractModel):
             keys, hypothesis, self.features.inputs(state, wrench)
         )
         return self.features.next_state(state, outputs)
+
+
+def fit_to_nothing(
+    key: Key, features: BodyFeatures, regressor: AbstractRegressor
+) -> PyTree:
+    """What a regressor knows of each moving body before anything was seen.
+
+    Args:
+        key: random key.
+        features: of the bodies.
+        regressor: the same for all.
+
+    Returns:
+        Its fits, leading axis `moving`.
+    """
+    num_inputs, num_outputs = features.num_inputs, features.num_outputs
+    keys = jax.random.split(key, len(features.moving))
+    return jax.vmap(lambda one: regressor.init(one, num_inputs, num_outputs))(keys)
+
+
+def add_and_tune(regressor: AbstractRegressor, learnt: PyTree, *row: Array) -> PyTree:
+    """Take one row of each moving body in, and choose settings where that is due.
+
+    Args:
+        regressor: of each body.
+        learnt: fits so far, leading axis `moving`.
+        row: arguments of `regressor.add` after the fit, leading axis `moving`.
+
+    Returns:
+        The fits now.
+    """
+    learnt = jax.vmap(regressor.add)(learnt, *row)
+    is_due = jnp.any(jax.vmap(regressor.is_due)(learnt))
+    return jax.lax.cond(is_due, jax.vmap(regressor.tune), lambda same: same, learnt)

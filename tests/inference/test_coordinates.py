@@ -8,8 +8,8 @@ from boomdp_jax.inference.block import make_block
 from boomdp_jax.physics import scene_spec_from_dict
 
 
-def block(**fields):
-    spec = scene_spec_from_dict(
+def scene_of(**fields):
+    return scene_spec_from_dict(
         {
             "schema": "planar-scene-1",
             "dt": 0.02,
@@ -20,8 +20,12 @@ def block(**fields):
             **fields,
         }
     )
+
+
+def block(time_step=0.02, **fields):
+    spec = scene_of(**fields)
     state = np.zeros((3, 1, 6))
-    return make_block(spec, (0,), make_history(state, state[..., :3], state, 0.02))
+    return make_block(spec, (0,), make_history(state, state[..., :3], state, time_step))
 
 
 def decode(b, z, active=True):
@@ -101,3 +105,12 @@ def test_random_coordinates_give_finite_positive_params():
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(params))
     assert np.all(params.density > 0)
     assert np.all(params.wheel.viscous[..., 0] < params.wheel.viscous[..., 1])
+
+
+@pytest.mark.parametrize(("time_step", "whole"), [(0.02, True), (0.4, False)])
+def test_long_steps_are_cut_as_the_engine_cuts_them(time_step, whole):
+    # By the recording's steps; the scene's own is 0.02 s in both cases.
+    b, num = block(time_step), scene_of().scene.num_substeps
+    assert num > 1
+    scene = b.target.log_likelihood.coordinates.scene
+    assert scene.num_substeps == (1 if whole else num)
