@@ -13,6 +13,7 @@ static models; Gilks and Berzuini (2001), Following a moving target.
 
 import functools
 import time
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -69,6 +70,14 @@ class Observed(NamedTuple):
 
     step: OnlineInfo
     refit: RefitInfo | None
+
+
+@functools.lru_cache(maxsize=64)
+def _compiled_step(
+    bodies: tuple[tuple[tuple[int, ...], ...], ...], forgetting: float
+) -> Callable:
+    """`refresh` of blocks by groups; beliefs of equal shapes share its programs."""
+    return jax.jit(functools.partial(refresh, bodies, forgetting))
 
 
 class OnlineBelief:
@@ -128,7 +137,7 @@ class OnlineBelief:
             raise ValueError(f"forgetting: expected in (0, 1], got {forgetting}")
         if not 0.0 < change_rate < 1.0:
             raise ValueError(f"change_rate: expected in (0, 1), got {change_rate}")
-        if dt is not None and not (np.isfinite(dt) and dt > 0):
+        if dt is not None and not 0 < dt < np.inf:
             raise ValueError(f"dt: expected positive seconds, got {dt}")
         if "actuator.delay" in spec.unknown_numbers:
             raise ValueError(
@@ -161,16 +170,8 @@ class OnlineBelief:
         for index, block in enumerate(self._blocks):
             groups.setdefault(signature(block.target), []).append(index)
         self._groups = list(groups.values())
-        self._step = jax.jit(
-            functools.partial(
-                refresh,
-                tuple(
-                    tuple(self._blocks[index].bodies for index in group)
-                    for group in self._groups
-                ),
-                self._settings.forgetting,
-            )
-        )
+        bodies = [[self._blocks[index].bodies for index in g] for g in self._groups]
+        self._step = _compiled_step(tuple(map(tuple, bodies)), float(forgetting))
 
     @property
     def blocks(self) -> list[tuple[str, ...]]:
@@ -215,8 +216,7 @@ class OnlineBelief:
         if history is None:
             return state
         table = self._checked(history)
-        num_rows = int(table.num_transitions)
-        if num_rows == 0:
+        if (num_rows := int(table.num_transitions)) == 0:
             return state
         state = eqx.tree_at(
             lambda s: (s.history, s.num_rows, s.num_seen),
@@ -318,8 +318,8 @@ class OnlineBelief:
                 )
                 found.append(info)
         latest = max((int(b.begin) for b in beliefs.values()), default=0)
-        integer = belief.num_seen.dtype
-        num_seen, used = int(belief.num_seen), num_rows - latest
+        integer, used = belief.num_seen.dtype, num_rows - latest
+        num_seen = int(belief.num_seen)
         wait = max(_FIRST_REFIT, int(_GROWN * used))
         rest = max(_REST, int(_RENEWED * used))
         belief = eqx.tree_at(
