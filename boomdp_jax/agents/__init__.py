@@ -5,5 +5,15 @@ from boomdp_jax.agents.agent import make_agent as make_agent
 from boomdp_jax.agents.agent import random_agent as random_agent
 from boomdp_jax.agents.episode import EpisodeRecord as EpisodeRecord
 from boomdp_jax.agents.episode import run_episode as run_episode
+from boomdp_jax.agents.piecewise_agent import (
+    make_piecewise_agent as make_piecewise_agent,
+)
 
-__all__ = ["Agent", "EpisodeRecord", "make_agent", "random_agent", "run_episode"]
+__all__ = [
+    "Agent",
+    "EpisodeRecord",
+    "make_agent",
+    "make_piecewise_agent",
+    "random_agent",
+    "run_episode",
+]

@@ -13,7 +13,7 @@ from boomdp_jax.envs.environment import AbstractEnvironment
 from boomdp_jax.models.model import AbstractModel
 from boomdp_jax.physics.state import State
 from boomdp_jax.planning.belief import Belief
-from boomdp_jax.planning.plan import Plan
+from boomdp_jax.planning.plan import Plan, plan_of
 from boomdp_jax.planning.sparse_sampling import sparse_sampling
 
 PlanFn = Callable[[Key, Any, State, Plan | None], Plan]
@@ -118,7 +118,7 @@ def make_agent(
         return task.leaf_value(state, goal)
 
     @jax.jit
-    def plan(key, belief, state, previous):
+    def compiled(key, belief, state, sequence):
         return sparse_sampling(
             key,
             belief,
@@ -135,7 +135,15 @@ def make_agent(
             coordinates_fn=task.coordinates,
             capacity=capacity or hints.capacity,
             verify=True,
-            previous=previous,
+            previous=plan_of(sequence),
+        )
+
+    nothing = jnp.zeros((hints.depth, *task.actions.wrench.shape[1:]))
+
+    def plan(key, belief, state, previous):
+        # A plan to do nothing stands for none, so that all decisions are one program.
+        return compiled(
+            key, belief, state, nothing if previous is None else previous.sequence
         )
 
     return Agent(

@@ -15,7 +15,7 @@ LIKELIHOODS = ("auto", "filtered", "one-step", "open-loop")
 """Likelihoods of readings that exist."""
 
 
-TASKS = ("pendulum", "cart", "acrobot")
+TASKS = ("pendulum", "cart", "acrobot", "living-room")
 """Tasks of `run`."""
 
 AGENTS = ("true", "physics", "lr", "lwr", "gp", "ensemble", "random")

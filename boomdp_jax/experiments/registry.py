@@ -7,7 +7,9 @@ from boomdp_jax.agents.agent import Agent, make_agent, random_agent
 from boomdp_jax.envs.acrobot import Acrobot
 from boomdp_jax.envs.cart import Cart
 from boomdp_jax.envs.environment import AbstractEnvironment, EnvParams
+from boomdp_jax.envs.living_room import LivingRoom
 from boomdp_jax.envs.pendulum import Pendulum
+from boomdp_jax.experiments.room_agents import room_agent
 from boomdp_jax.inference.online import OnlineBelief
 from boomdp_jax.models.gaussian_process import GaussianProcess
 from boomdp_jax.models.linear import LinearRegression
@@ -22,7 +24,12 @@ MakeTask = Callable[..., AbstractEnvironment]
 MakeModel = Callable[[AbstractEnvironment, EnvParams], AbstractModel]
 
 TASKS: Mapping[str, MakeTask] = MappingProxyType(
-    {"pendulum": Pendulum, "cart": Cart, "acrobot": Acrobot}
+    {
+        "pendulum": Pendulum,
+        "cart": Cart,
+        "acrobot": Acrobot,
+        "living-room": LivingRoom,
+    }
 )
 """Each takes `num_steps`."""
 
@@ -55,13 +62,21 @@ def _regression(make: Callable[[], AbstractRegressor], frame: str) -> MakeModel:
     return build
 
 
+_REGRESSIONS: dict[str, tuple[Callable[[], AbstractRegressor], str]] = {
+    "lr": (LinearRegression, "world"),
+    "lwr": (LocallyWeighted, "body"),
+    "gp": (GaussianProcess, "body"),
+    "ensemble": (NeuralEnsemble, "body"),
+}
+"""What is fitted, and the frame that bodies are seen in."""
+
 _MODELS: dict[str, tuple[MakeModel, int]] = {
     "true": (_true, 1),
     "physics": (_physics, _NUM_HYPOTHESES),
-    "lr": (_regression(LinearRegression, "world"), 1),
-    "lwr": (_regression(LocallyWeighted, "body"), 1),
-    "gp": (_regression(GaussianProcess, "body"), 1),
-    "ensemble": (_regression(NeuralEnsemble, "body"), _NUM_HYPOTHESES),
+    "lr": (_regression(*_REGRESSIONS["lr"]), 1),
+    "lwr": (_regression(*_REGRESSIONS["lwr"]), 1),
+    "gp": (_regression(*_REGRESSIONS["gp"]), 1),
+    "ensemble": (_regression(*_REGRESSIONS["ensemble"]), _NUM_HYPOTHESES),
 }
 """Model, and hypotheses that a decision rests on."""
 
@@ -116,6 +131,17 @@ def agent_of(name: str, task: AbstractEnvironment, params: EnvParams) -> Agent:
         ValueError: no such agent.
     """
     check_agent(name)
+    if isinstance(task, LivingRoom):
+        num = 1 if name == "random" else _MODELS[name][1]
+        is_one_law = name in _REGRESSIONS and num == 1
+        return room_agent(
+            name,
+            task,
+            params,
+            regressor=_REGRESSIONS.get(name),
+            num_hypotheses=num,
+            exploration=_EXPLORATION if is_one_law else 0.0,
+        )
     if name == "random":
         return random_agent(_true(task, params), task.hints.action_repeat)
     build, num_hypotheses = _MODELS[name]

@@ -8,6 +8,8 @@ from boomdp_jax.models.model import AbstractModel as AbstractModel
 from boomdp_jax.models.neural_ensemble import NeuralEnsemble as NeuralEnsemble
 from boomdp_jax.models.object_oriented import ObjectOriented as ObjectOriented
 from boomdp_jax.models.outline_contact import touched_sectors as touched_sectors
+from boomdp_jax.models.per_body import PerBody as PerBody
+from boomdp_jax.models.per_body import ScenePhysics as ScenePhysics
 from boomdp_jax.models.physics_model import PhysicsModel as PhysicsModel
 from boomdp_jax.models.point_fit import CmaEs as CmaEs
 from boomdp_jax.models.point_fit import GaussNewton as GaussNewton
@@ -28,8 +30,10 @@ __all__ = [
     "LocallyWeighted",
     "NeuralEnsemble",
     "ObjectOriented",
+    "PerBody",
     "PhysicsModel",
     "PointFit",
+    "ScenePhysics",
     "TrueModel",
     "touched_sectors",
 ]

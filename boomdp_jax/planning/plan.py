@@ -1,6 +1,8 @@
 """What every planner returns."""
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
 from boomdp_jax.core.arrays import FloatScalar, IntScalar
@@ -41,3 +43,21 @@ class Plan(eqx.Module):
     info: SearchInfo
     tree: PyTree = None
     """Nodes by level, where asked for."""
+
+
+def plan_of(sequence: PyTree) -> Plan:
+    """A plan of which nothing but its actions is known, to be gone on with.
+
+    Args:
+        sequence: actions, leading axis `level`.
+    """
+    zero = jnp.zeros((), int)
+    return Plan(
+        index=zero,
+        action=jax.tree.map(lambda leaf: leaf[0], sequence),
+        value=jnp.full((), -jnp.inf),
+        q_values=None,
+        hypothesis_q_values=None,
+        sequence=sequence,
+        info=SearchInfo(num_model_calls=zero),
+    )
