@@ -7,7 +7,8 @@ import pytest
 
 from boomdp_jax.envs import LivingRoom
 from boomdp_jax.envs.blocking import box_separation
-from boomdp_jax.envs.living_room import GOAL_RADIUS, PIECES
+from boomdp_jax.envs.furniture import PIECES
+from boomdp_jax.envs.living_room import GOAL_RADIUS
 from boomdp_jax.physics import State, step
 
 TASK = LivingRoom(num_steps=5)

@@ -73,7 +73,11 @@ def test_another_run_does_not_go_into_the_folder(whole):
 @pytest.mark.parametrize(
     ("arguments", "options", "message"),
     [
-        (("sea", "random"), {}, "task: expected one of pendulum, cart, acrobot; got"),
+        (
+            ("sea", "random"),
+            {},
+            "task: expected one of pendulum, cart, acrobot, living-room; got",
+        ),
         (("cart", "lucky"), {}, "agent: expected one of true, physics"),
         (("cart", "true"), {"num_seeds": 0}, "num_seeds: expected at least 1, got 0"),
         (("cart", "true"), {"num_steps": 0}, "num_steps: expected at least 1, got 0"),
