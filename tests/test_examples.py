@@ -142,3 +142,17 @@ def test_fourth_example_plans_round_a_wall(tmp_path):
     assert result.returncode == 0, result.stderr
     assert "reached the goal: True" in result.stdout
     assert_is_picture(tmp_path / "tree.png")
+
+
+@pytest.mark.slow
+def test_fifth_example_runs_agents_and_goes_on(tmp_path):
+    for expected in ("", "1 of 1 were there"):
+        result = run_example("05_learn_while_acting.py", "--quick", "--out", tmp_path)
+        assert result.returncode == 0, result.stderr[-2000:]
+        assert expected in result.stderr
+    lines = [line for line in result.stdout.splitlines() if line]
+    # Who knows the cart gets there; a law is not learnt in 30 steps.
+    returns = {line.split()[0]: float(line.split()[2]) for line in lines[3:5]}
+    assert returns["true"] > returns["lwr"]
+    assert_is_picture(tmp_path / "curves.png")
+    assert (tmp_path / "cart-true.gif").read_bytes().startswith(b"GIF8")

@@ -68,6 +68,7 @@ def _make_parser() -> argparse.ArgumentParser:
     _add_predict(commands.add_parser("predict", help="held-out error and coverage"))
     _add_simulate(commands.add_parser("simulate", help="from wrenches to a recording"))
     _add_run(commands.add_parser("run", help="an agent learns a task, over seeds"))
+    _add_plot(commands.add_parser("plot", help="from runs to curves and a table"))
     _add_view(commands.add_parser("view", help="from a recording to a moving picture"))
     return parser
 
@@ -166,6 +167,13 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         metavar=("SX", "STHETA", "SV", "SOMEGA"),
         help="standard deviation of the readings that are learnt from",
     )
+
+
+def _add_plot(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("runs", nargs="+", metavar="DIR", help="what run --out wrote, of one task")
+    add("--out", metavar="FIG.png", help="default: curves.png in the first folder")
+    add("--json", action="store_true", help="one JSON object a run, a line each")
 
 
 def _add_view(parser: argparse.ArgumentParser) -> None:

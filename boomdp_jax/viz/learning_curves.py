@@ -1,0 +1,107 @@
+"""Curves of runs over steps, with bands."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from boomdp_jax.viz.style import (
+    BASELINE,
+    EDGE,
+    FLOOR,
+    GRID,
+    PIN,
+    PREDICTION,
+    ROD,
+    SLIDE,
+    STATIC,
+)
+
+Band = tuple[
+    Float[np.ndarray, " step"], Float[np.ndarray, " step"], Float[np.ndarray, " step"]
+]
+"""Middle, lower and upper end."""
+
+_LEAST_ERROR = 1e-6
+"""Of a prediction that is worth drawing [m]."""
+_BY_AGENT = {
+    "true": EDGE,
+    "physics": PREDICTION,
+    "lr": ROD,
+    "lwr": BASELINE,
+    "gp": FLOOR,
+    "ensemble": PIN,
+    "random": STATIC,
+}
+
+
+def draw_curves(
+    ax: Any,
+    bands: Mapping[str, Band],
+    *,
+    ylabel: str,
+    is_logarithmic: bool = False,
+) -> None:
+    """Draw a curve with its band for each agent.
+
+    Args:
+        ax: a `matplotlib.axes.Axes`.
+        bands: by name, one value a step from step 1 on; NaN is left out.
+        ylabel: what is drawn, with its unit.
+        is_logarithmic: whether the axis is.
+    """
+    for name, (middle, low, high) in bands.items():
+        colour = _BY_AGENT.get(name.partition(" ")[0], SLIDE)
+        steps = np.arange(1, len(middle) + 1)
+        ax.fill_between(steps, low, high, color=colour, alpha=0.2, linewidth=0)
+        ax.plot(steps, middle, color=colour, linewidth=1.6, label=name)
+    if is_logarithmic:
+        ax.set_yscale("log")
+    ax.set_xlabel("step")
+    ax.set_ylabel(ylabel)
+    ax.set_xlim(left=1)
+    ax.grid(color=GRID, linewidth=0.8)
+    ax.set_axisbelow(True)
+    for side in ("top", "right"):
+        ax.spines[side].set_visible(False)
+
+
+def plot_curves(
+    reward: Mapping[str, Band], model_error: Mapping[str, Band], *, title: str
+) -> Any:
+    """A figure of reward and of model error by step.
+
+    Args:
+        reward: by agent.
+        model_error: by agent [m].
+        title: of the figure.
+
+    Returns:
+        The `matplotlib.figure.Figure`.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+    """
+    from boomdp_jax.viz.snapshots import new_figure
+
+    figure = new_figure((10.0, 4.0))
+    left, right = figure.subplots(1, 2)
+    draw_curves(left, reward, ylabel="mean reward of a step, 95 % band")
+    positive: dict[str, Band] = {}
+    for name, (middle, low, high) in model_error.items():
+        # Who knows the world errs by rounding alone, which would stretch the axis.
+        if np.nanmax(middle) > _LEAST_ERROR:
+            middle, low, high = (
+                np.maximum(part, _LEAST_ERROR) for part in (middle, low, high)
+            )
+            positive[name] = middle, low, high
+    draw_curves(
+        right,
+        positive,
+        ylabel="error of foretold positions, one step [m]",
+        is_logarithmic=bool(positive),
+    )
+    left.legend(frameon=False)
+    figure.suptitle(title)
+    return figure
