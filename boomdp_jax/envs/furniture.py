@@ -86,10 +86,6 @@ def piece_scene(piece: Piece) -> SceneSpec:
                     "pose": [*piece.start, 0.0],
                     "shape": {"type": "box", "half_extents": list(piece.half_extents)},
                     "density": None,
-                    # A step of what can touch is cut finer. Friction in proportion
-                    # to speed depends on that by a tenth, and a piece by itself has to
-                    # be what it is in the room.
-                    "contact": _SURFACE,
                 }
             ],
             "constraints": [

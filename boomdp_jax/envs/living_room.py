@@ -41,7 +41,7 @@ PUSH = 220.0
 """Force on a square metre of furniture [N/m²]: who pushes judges by size."""
 _NUM_STEPS, _LEAF_STEPS = 1000, 10.0
 _NUM_DIRECTIONS = 8
-_NUM_SWEEPS = 2
+_NUM_SWEEPS = 4
 _NUM_WRENCHES = _NUM_DIRECTIONS + 2
 """On each piece: forces, and torques both ways."""
 _NEAR = 0.02
@@ -85,11 +85,17 @@ class LivingRoom(AbstractEnvironment):
 
     @property
     def scene(self) -> Scene:
-        """Arrays of `spec`, contacts gone over twice.
+        """Arrays of `spec`, a step cut into as many parts as a lone piece's.
 
-        Once is not enough where one piece is pushed at another one that is at a wall.
+        Friction in proportion to speed depends on them by a tenth, and a piece has to
+        be in the room what it is alone. Contacts are gone over more than once instead,
+        for pieces that are pushed at others that are at a wall.
         """
-        return dataclasses.replace(super().scene, num_sweeps=_NUM_SWEEPS)
+        return dataclasses.replace(
+            super().scene,
+            num_substeps=self.pieces[0].scene.num_substeps,
+            num_sweeps=_NUM_SWEEPS,
+        )
 
     @property
     def num_pieces(self) -> int:
@@ -197,11 +203,7 @@ class LivingRoom(AbstractEnvironment):
     def lone_scenes(self) -> Scene:
         """Scenes of the pieces, each by itself, leading axis `piece`."""
         with jax.ensure_compile_time_eval():
-            # Alone there is nothing to touch.
-            scenes = [
-                dataclasses.replace(spec.scene, collides=None, smoothing=None)
-                for spec in self.pieces
-            ]
+            scenes = [spec.scene for spec in self.pieces]
             return jax.tree.map(lambda *leaves: jnp.stack(leaves), *scenes)
 
     def lone_params(self, physics: Params) -> Params:
