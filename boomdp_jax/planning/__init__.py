@@ -15,6 +15,8 @@ from boomdp_jax.planning.forward_search import (
 )
 from boomdp_jax.planning.gradient_shooting import gradient_shooting as gradient_shooting
 from boomdp_jax.planning.leaf import rollout_leaf as rollout_leaf
+from boomdp_jax.planning.learned_leaf import LearnedLeaf as LearnedLeaf
+from boomdp_jax.planning.learned_leaf import learned_leaf as learned_leaf
 from boomdp_jax.planning.mctx_search import mctx_search as mctx_search
 from boomdp_jax.planning.mppi import mppi as mppi
 from boomdp_jax.planning.plan import Plan as Plan
@@ -27,6 +29,7 @@ from boomdp_jax.planning.tree_levels import tree_levels as tree_levels
 __all__ = [
     "Belief",
     "ForwardSearchReport",
+    "LearnedLeaf",
     "PathReport",
     "Plan",
     "SearchInfo",
@@ -36,6 +39,7 @@ __all__ = [
     "cross_entropy_method",
     "forward_search_sparse_sampling",
     "gradient_shooting",
+    "learned_leaf",
     "mctx_search",
     "mppi",
     "random_shooting",
