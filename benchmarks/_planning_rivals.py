@@ -48,8 +48,7 @@ def rivals(
             {
                 **grid,
                 "stratum_size": jnp.asarray(task.stratum_size, jnp.float32),
-                # Following the plans of all actions, and the one before, is paid for.
-                "capacity": max(1, num_calls // (num_actions * per_sequence) - 2),
+                "capacity": largest_capacity(task, num_calls),
                 "verify": True,
             },
             True,
@@ -114,6 +113,19 @@ def rivals(
         for name, (planner, options, reuses) in made.items()
         if name in chosen and (HAS_MCTX or not name.startswith("mctx"))
     ]
+
+
+def largest_capacity(task: Task, num_calls: int) -> int:
+    """Nodes a level of the widest tree that keeps to a budget; at least one.
+
+    Following the plans of all actions, and the one before, is paid for.
+    """
+    num_actions, held = task.actions.shape[0], task.action_repeat
+    left = num_calls - (num_actions + 1) * task.depth * held
+    # The root and its children, none of which is merged.
+    left -= num_actions * held * (1 + num_actions * (task.depth > 1))
+    num_levels = max(1, task.depth - 2)
+    return max(1, left // (num_actions * held * num_levels))
 
 
 def _called(planner: Callable, options: dict, reuses: bool) -> Callable:

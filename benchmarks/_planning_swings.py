@@ -3,7 +3,14 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _planning_task import NUM_LEAF_STEPS, Task, scene_of, single_body, wrapped
+from _planning_task import (
+    NUM_LEAF_STEPS,
+    Task,
+    scene_of,
+    single_body,
+    within_circle,
+    wrapped,
+)
 
 from boomdp_jax.physics import State, step
 
@@ -38,12 +45,14 @@ def pendulum() -> Task:
         }
     )
     mass = 100.0 * np.pi * 0.05**2
-    angles = np.arange(8) * np.pi / 4
-    forces = BOB_FORCE * mass * 9.81 * np.stack([np.cos(angles), np.sin(angles)], 1)
+    angles = np.arange(16) * np.pi / 8
+    limit = float(BOB_FORCE * mass * 9.81)
+    forces = limit * np.stack([np.cos(angles), np.sin(angles)], 1)
     actions = np.concatenate([forces, np.zeros((1, 2))])
 
     def transition(key, hypothesis, state, action):
-        wrench = jnp.zeros((1, 3)).at[0, :2].set(action)
+        force = within_circle(action, limit)
+        wrench = jnp.zeros((1, 3)).at[0, :2].set(force)
         state, _ = step(spec.scene, hypothesis, state, wrench)
         return state, False
 
@@ -72,15 +81,15 @@ def pendulum() -> Task:
             "straight": lambda h, s: -NUM_LEAF_STEPS * from_upright(s),
         },
         coordinates_fn=lambda s: jnp.stack([wrapped(s.pose[0, 2]), s.twist[0, 2]]),
-        cell_size=np.array([0.1, 0.3]),
+        cell_size=np.array([0.05, 0.15]),
         stratum_size=np.array([0.4, 1.2]),
         starts=start,
         num_steps=300,
         cost_bound=np.pi,
         is_reached=lambda s: from_upright(s) < 0.2,
-        action_repeat=4,
-        depth=8,
-        action_repeats=(2, 4, 6),
+        action_repeat=2,
+        depth=16,
+        action_repeats=(2, 3, 4),
     )
 
 

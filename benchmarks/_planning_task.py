@@ -60,3 +60,13 @@ def single_body(pose, twist) -> State:
 def wrapped(angle):
     """The same direction, between −π and π."""
     return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
+
+
+def within_circle(force, largest: float):
+    """The same direction, no stronger than `largest`.
+
+    Planners of continuous actions choose from a box, whose corners would be stronger
+    than any listed action.
+    """
+    size = jnp.sqrt(jnp.sum(force**2) + 1e-12)
+    return force * jnp.minimum(1.0, largest / size)

@@ -4,7 +4,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _planning_task import NUM_LEAF_STEPS, Task, scene_of, single_body, wrapped
+from _planning_task import (
+    NUM_LEAF_STEPS,
+    Task,
+    scene_of,
+    single_body,
+    within_circle,
+    wrapped,
+)
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
@@ -23,12 +30,13 @@ POCKET = np.array(
 )
 """Walls: least x and y, largest x and y [m]."""
 POINT_GOAL = np.array([2.0, 0.0])
+POINT_FORCE = 2.0
 
 
 def point() -> Task:
     def transition(key, hypothesis, state, action):
         place, velocity = state
-        velocity = 0.95 * velocity + 0.1 * action
+        velocity = 0.95 * velocity + 0.1 * within_circle(action, POINT_FORCE)
         moved = place + 0.1 * velocity
         hits = _is_inside(moved, POCKET)
         place = jnp.where(hits, place, moved)
@@ -51,7 +59,7 @@ def point() -> Task:
         name="point",
         transition_fn=transition,
         reward_fn=lambda h, s, a, n: -_distance(n[0], POINT_GOAL),
-        actions=2.0 * jnp.array([[0.0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]),
+        actions=POINT_FORCE * jnp.array([[0.0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]),
         hypothesis=jnp.zeros(()),
         leaves={
             "zero": lambda h, s: 0.0,
@@ -173,7 +181,8 @@ def cart() -> Task:
     actions = CART_FORCE * np.stack([np.cos(angles), np.sin(angles)], 1)
 
     def transition(key, hypothesis, state, action):
-        wrench = jnp.zeros((1, 3)).at[0, :2].set(action)
+        force = within_circle(action, CART_FORCE)
+        wrench = jnp.zeros((1, 3)).at[0, :2].set(force)
 
         def one(_, state):
             moved, _ = step(spec.scene, hypothesis, state, wrench)
