@@ -46,6 +46,12 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=24)
     parser.add_argument("--calls", nargs="+", type=int, default=(1000, 4000, 10_000))
     parser.add_argument(
+        "--belief-calls",
+        type=int,
+        default=60_000,
+        help="of a decision under sixteen hypotheses, all together",
+    )
+    parser.add_argument(
         "--milliseconds", nargs="+", type=float, default=(), help="rows at equal time"
     )
     parser.add_argument(
@@ -99,15 +105,15 @@ def report_belief(reporter: Reporter, arguments) -> None:
     belief = Belief(hypotheses, log_weight)
     truths = axle_hypotheses(num, arguments.seed + 1)
     starts = starts_of(task, num, arguments.seed)
-    num_calls = max(arguments.calls)
+    num_calls = arguments.belief_calls
     results = {}
     for hypothesis in ("root", "map", "mean", "fresh"):
         share = 16 if hypothesis == "root" else 1
         # Trees of sixteen hypotheses have a sixteenth of the places each.
         planner = rivals(task, "straight", num_calls // share, ("sparse sampling",))[0]
-        options = {"hypotheses": hypothesis}
-        if hypothesis == "fresh":
-            options["verify"] = False
+        # Whose plans are followed makes no odds under one hypothesis; under sixteen,
+        # each judged by its own best plan, fewer get round the wall.
+        options = {"hypotheses": hypothesis, "verify": False}
         plan = _with_options(planner.plan, options)
         results[hypothesis] = episodes(
             task, plan, belief, truths, starts, arguments.seed

@@ -148,7 +148,9 @@ def _in_turn(
 ) -> Float[Array, " child"]:
     """Priorities: all that were chosen before the last turn, then its own by score."""
     number = jnp.arange(order.shape[0])
-    group = _best_of_group(stratum, order, is_leader)
+    # There is nothing to choose where all have room.
+    is_room = jnp.sum(is_leader) <= capacity
+    group = _best_of_group(stratum, order, is_leader & ~is_room)
     num_wanted = jnp.minimum(capacity, jnp.sum(is_leader))
 
     def one_turn(carry):
@@ -157,8 +159,6 @@ def _in_turn(
         best = _best_of_slot(group, order, is_left, number.shape[0])
         return chosen | (is_left & (best[group] == number)), chosen
 
-    # There is nothing to choose where all have room.
-    is_room = jnp.sum(is_leader) <= capacity
     first = is_leader & (is_room | (group == number))
     chosen, before = lax.while_loop(
         lambda carry: jnp.sum(carry[0]) < num_wanted,
