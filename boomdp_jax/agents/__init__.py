@@ -3,6 +3,8 @@
 from boomdp_jax.agents.agent import Agent as Agent
 from boomdp_jax.agents.agent import make_agent as make_agent
 from boomdp_jax.agents.agent import random_agent as random_agent
+from boomdp_jax.agents.curiosity import curious as curious
+from boomdp_jax.agents.curiosity import curious_of_pieces as curious_of_pieces
 from boomdp_jax.agents.episode import EpisodeRecord as EpisodeRecord
 from boomdp_jax.agents.episode import run_episode as run_episode
 from boomdp_jax.agents.piecewise_agent import (
@@ -12,6 +14,8 @@ from boomdp_jax.agents.piecewise_agent import (
 __all__ = [
     "Agent",
     "EpisodeRecord",
+    "curious",
+    "curious_of_pieces",
     "make_agent",
     "make_piecewise_agent",
     "random_agent",

@@ -18,7 +18,25 @@ LIKELIHOODS = ("auto", "filtered", "one-step", "open-loop")
 TASKS = ("pendulum", "cart", "acrobot", "living-room")
 """Tasks of `run`."""
 
-AGENTS = ("true", "physics", "lr", "lwr", "gp", "ensemble", "random")
+AGENTS = (
+    "true",
+    "physics",
+    "physics-map",
+    "physics-informative",
+    "physics-pretrained",
+    "point-fit",
+    "cma-es",
+    "lr",
+    "lr-body",
+    "lwr",
+    "lwr-world",
+    "lwr-pretrained",
+    "oo-lwr",
+    "gp",
+    "ensemble",
+    "physics-kinds",
+    "random",
+)
 """Agents of `run`."""
 
 

@@ -30,6 +30,7 @@ from boomdp_jax.envs.walls import (
     walls_between,
 )
 from boomdp_jax.physics.params import Params
+from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
 from boomdp_jax.physics.state import State
 from boomdp_jax.physics.step import step
@@ -95,6 +96,37 @@ def cart_scene(*, is_known: bool) -> SceneSpec:
     )
 
 
+def _walled_scene() -> SceneSpec:
+    """Outlines of the cart and, as static boxes, of the walls."""
+    walls = walls_between(np.array(ROOM))
+    boxes = [
+        {
+            "name": f"wall {index}",
+            "static": True,
+            "pose": [*middle, 0.0],
+            "shape": {"type": "box", "half_extents": half},
+        }
+        for index, (middle, half) in enumerate(
+            zip(walls.middle.tolist(), walls.half_extents.tolist(), strict=True)
+        )
+    ]
+    cart = {
+        "name": "cart",
+        "pose": list(START),
+        "shape": {"type": "polygon", "vertices": np.array(CART_OUTLINE).tolist()},
+        "density": DENSITY,
+    }
+    return scene_spec_from_dict(
+        {
+            "schema": "planar-scene-1",
+            "gravity": [0.0, 0.0],
+            "dt": _TIME_STEP,
+            "bodies": [cart, *boxes],
+        },
+        "cart among walls",
+    )
+
+
 class Cart(AbstractEnvironment):
     """Push a cart round a wall; `start_spread`: of its pose."""
 
@@ -114,6 +146,14 @@ class Cart(AbstractEnvironment):
         self.walls = walls_between(np.array(ROOM))
         # The engine's outline: about the centre of mass.
         self.outline = outline_of(np.asarray(self.spec.scene.vertices[0], float))
+
+    @property
+    def surroundings(self) -> tuple[Scene, Float[Array, "other 3"]]:
+        """The cart among its walls, and where these are."""
+        with jax.ensure_compile_time_eval():
+            middle = self.walls.middle
+            pose = jnp.concatenate([middle, jnp.zeros_like(middle[:, :1])], axis=1)
+            return _walled_scene().scene, pose
 
     def default_params(self) -> EnvParams:
         """Starts within a quarter of a metre and in any direction."""

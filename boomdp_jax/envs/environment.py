@@ -129,6 +129,14 @@ class AbstractEnvironment(abc.ABC):
             return self.spec.scene
 
     @property
+    def surroundings(self) -> tuple[Scene, Float[Array, "other 3"]]:
+        """All that can be seen, and poses of what states do not tell of, such as walls.
+
+        The scene's first bodies are those of `scene`.
+        """
+        return self.scene, jnp.zeros((0, 3))
+
+    @property
     def num_actions(self) -> int:
         """How many things can be done at each step."""
         return self.actions.num_actions

@@ -8,6 +8,7 @@ bits however often it was stopped and however many machines shared it.
 """
 
 import os
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -24,6 +25,10 @@ from boomdp_jax.inference.posterior import library_versions
 
 SCHEMA = "boomdp-run-1"
 """Version of the folder's format."""
+
+MAKING = "making_seconds"
+"""Beside an episode's record: the time it took to make the agent, all that it was
+taught beforehand included; the same for all episodes of one process."""
 
 
 class Run(NamedTuple):
@@ -69,13 +74,15 @@ class Run(NamedTuple):
         """
         task = make_task(self.task, self.num_steps)
         params = task.default_params()
-        agent = agent_of(self.agent, task, params)
         noise = None if self.noise is None else on_device(self.noise)
+        begin = time.perf_counter()
+        agent = agent_of(self.agent, task, params, reading_noise=noise)
+        made = {MAKING: np.asarray(time.perf_counter() - begin)}
         for seed in seeds:
             record, _ = run_episode(
                 jax.random.key(seed), task, params, agent, reading_noise=noise
             )
-            write_npz(self.path(seed), record._asdict())
+            write_npz(self.path(seed), record._asdict() | made)
             if report is not None:
                 report(seed, record)
 
@@ -84,14 +91,14 @@ class Run(NamedTuple):
 
         Returns:
             What `results.npz` then holds: the fields of `EpisodeRecord` with a leading
-            axis `seed`; None while episodes are missing.
+            axis `seed`, and `making_seconds`; None while episodes are missing.
         """
         if self.missing():
             return None
         records = [read_npz(self.path(seed)) for seed in range(self.num_seeds)]
         results = {
             field: np.stack([record[field] for record in records])
-            for field in EpisodeRecord._fields
+            for field in (*EpisodeRecord._fields, MAKING)
         }
         write_npz(self.folder / "results.npz", results)
         return results
@@ -128,7 +135,7 @@ def begin_run(
     if num_seeds < 1:
         raise ValueError(f"num_seeds: expected at least 1, got {num_seeds}")
     made = make_task(task, num_steps)
-    check_agent(agent)
+    check_agent(agent, made)
     scale = None
     if noise is not None:
         scale = tuple(float(number) for number in noise)

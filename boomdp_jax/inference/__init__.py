@@ -24,7 +24,7 @@ from boomdp_jax.inference.numpyro_model import make_model as make_model
 from boomdp_jax.inference.nuts import run_nuts as run_nuts
 from boomdp_jax.inference.online import Observed as Observed
 from boomdp_jax.inference.online import OnlineBelief as OnlineBelief
-from boomdp_jax.inference.online import RefitInfo as RefitInfo
+from boomdp_jax.inference.online_refit import RefitInfo as RefitInfo
 from boomdp_jax.inference.online_refresh import OnlineInfo as OnlineInfo
 from boomdp_jax.inference.online_state import BeliefState as BeliefState
 from boomdp_jax.inference.posterior import Posterior as Posterior

@@ -1,11 +1,16 @@
 """Transition models that an agent can learn: physics, regressions, point fits."""
 
 from boomdp_jax.models.features import BodyFeatures as BodyFeatures
+from boomdp_jax.models.fixed_belief import FixedBelief as FixedBelief
 from boomdp_jax.models.gaussian_process import GaussianProcess as GaussianProcess
+from boomdp_jax.models.known_kinds import KnownKinds as KnownKinds
 from boomdp_jax.models.linear import LinearRegression as LinearRegression
 from boomdp_jax.models.locally_weighted import LocallyWeighted as LocallyWeighted
 from boomdp_jax.models.model import AbstractModel as AbstractModel
 from boomdp_jax.models.neural_ensemble import NeuralEnsemble as NeuralEnsemble
+from boomdp_jax.models.object_among_others import (
+    ObjectAmongOthers as ObjectAmongOthers,
+)
 from boomdp_jax.models.object_oriented import ObjectOriented as ObjectOriented
 from boomdp_jax.models.outline_contact import touched_sectors as touched_sectors
 from boomdp_jax.models.per_body import PerBody as PerBody
@@ -24,11 +29,14 @@ __all__ = [
     "BodyFeatures",
     "BodyRegression",
     "CmaEs",
+    "FixedBelief",
     "GaussNewton",
     "GaussianProcess",
+    "KnownKinds",
     "LinearRegression",
     "LocallyWeighted",
     "NeuralEnsemble",
+    "ObjectAmongOthers",
     "ObjectOriented",
     "PerBody",
     "PhysicsModel",
