@@ -15,6 +15,9 @@ _PROGRAMS = Path(__file__).parents[1] / ".pytest_cache" / "xla"
 _MOST_DAYS = 14
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_PROGRAMS))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+# XLA takes its own tuning flags for features that the machine lacks, and says so at
+# length of each program that it loads.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402

@@ -40,6 +40,22 @@ AGENTS = (
 """Agents of `run`."""
 
 
+FIGURES = (
+    "1a",
+    "1b",
+    "2a",
+    "2b",
+    "cart",
+    "cart-noisy-1",
+    "cart-noisy-4",
+    "cart-noisy-16",
+    "cart-noisy-64",
+    "apartment",
+    "acrobot",
+)
+"""Figures of `figure`."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
 
@@ -87,6 +103,7 @@ def _make_parser() -> argparse.ArgumentParser:
     _add_simulate(commands.add_parser("simulate", help="from wrenches to a recording"))
     _add_run(commands.add_parser("run", help="an agent learns a task, over seeds"))
     _add_plot(commands.add_parser("plot", help="from runs to curves and a table"))
+    _add_figure(commands.add_parser("figure", help="figures of the papers, run anew"))
     _add_view(commands.add_parser("view", help="from a recording to a moving picture"))
     return parser
 
@@ -192,6 +209,22 @@ def _add_plot(parser: argparse.ArgumentParser) -> None:
     add("runs", nargs="+", metavar="DIR", help="what run --out wrote, of one task")
     add("--out", metavar="FIG.png", help="default: curves.png in the first folder")
     add("--json", action="store_true", help="one JSON object a run, a line each")
+
+
+def _add_figure(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("names", nargs="+", choices=FIGURES, metavar="NAME", help=", ".join(FIGURES))
+    add(
+        "--out",
+        required=True,
+        metavar="DIR",
+        help="NAME.png, and runs; the same command goes on where the folder stands",
+    )
+    add("--seeds", type=_whole(1), default=20, metavar="N", help="of each agent")
+    add("--steps", type=_whole(1), metavar="T", help="default: the figure's")
+    add("--agents", nargs="+", metavar="NAME", help="others than the figure's own")
+    add("--shard", type=_shard, metavar="I/N", help="do seeds I, I + N... only")
+    add("--json", action="store_true", help="one JSON object an agent, a line each")
 
 
 def _add_view(parser: argparse.ArgumentParser) -> None:

@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from boomdp_jax.cli.output import check_figure, print_json
@@ -26,11 +27,28 @@ def run(arguments: argparse.Namespace) -> None:
     Raises:
         ValueError: a folder that is no run, holds no episode, or is of another task.
     """
-    from boomdp_jax.viz.learning_curves import plot_curves
-
     folders = [Path(folder) for folder in arguments.runs]
     path = Path(arguments.out or folders[0] / "curves.png")
     check_figure(str(path))
+    report(folders, path, as_json=arguments.json)
+
+
+def report(
+    folders: Sequence[Path], path: Path, *, as_json: bool, title: str | None = None
+) -> None:
+    """Draw runs, and print their table or JSON lines.
+
+    Args:
+        folders: of runs of one setting.
+        path: of the figure.
+        as_json: one JSON object a run instead of a table.
+        title: of the figure; default: the setting.
+
+    Raises:
+        ValueError: a folder that is no run, holds no episode, or is of another task.
+    """
+    from boomdp_jax.viz.learning_curves import plot_curves
+
     runs = [load_run(folder) for folder in folders]
     check_comparable(runs)
     names = [_name(loaded) for loaded in runs]
@@ -43,11 +61,11 @@ def run(arguments: argparse.Namespace) -> None:
             name: mean_band(loaded.model_error)
             for name, loaded in zip(names, runs, strict=True)
         },
-        title=runs[0].setting,
+        title=title or runs[0].setting,
     )
     figure.savefig(path, dpi=150)
     found = scores(runs)
-    if arguments.json:
+    if as_json:
         for score in found:
             print_json({"task": runs[0].setting, **score._asdict()})
     else:

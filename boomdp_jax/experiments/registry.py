@@ -111,7 +111,7 @@ def agent_of(
             return random_agent(known, task.hints.action_repeat)
         return make_agent(name, task, known, params.goal, num_hypotheses=1)
     recipe = RECIPES[name]
-    model = recipe.build(_subject(task))
+    model = recipe.build(subject_of(task))
     if recipe.is_taught:
         sample_key, key = jax.random.split(teaching_key)
         samples = unbiased_samples(
@@ -131,8 +131,8 @@ def agent_of(
     )
 
 
-def _subject(task: AbstractEnvironment) -> Subject:
-    """All of a task's bodies at once."""
+def subject_of(task: AbstractEnvironment) -> Subject:
+    """All of a task's bodies at once, for a recipe."""
     return Subject(
         spec=task.spec,
         advance=task.advance,
