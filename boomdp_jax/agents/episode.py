@@ -38,8 +38,10 @@ class EpisodeRecord(NamedTuple):
     is, with what was learnt up to the decision: root mean square over bodies, mean over
     hypotheses [m]."""
     plan_seconds: Float[np.ndarray, " step"]
-    """Of sampling hypotheses and planning; zero where a decision was carried on."""
+    """Of sampling hypotheses and planning; zero where a decision was carried on. Of an
+    episode compiled whole, its time in equal parts, learning included."""
     learn_seconds: Float[np.ndarray, " step"]
+    """Not a number in an episode compiled whole, where it cannot be told."""
 
     @property
     def num_done(self) -> int:
@@ -103,7 +105,7 @@ def run_episode(
         before = now.physics
         _, now, reward, _, _ = compiled.step(None, now, index, params)
         next_reading = read_state(noise_keys[step + 1], now.physics, scale)
-        error = _position_error(
+        error = position_error(
             act_keys[step],
             agent.model,
             belief,
@@ -179,7 +181,7 @@ def read_state(key: Key, state: State, scale: Float[Array, "4"]) -> State:
 
 
 @eqx.filter_jit
-def _position_error(
+def position_error(
     key: Key,
     model: AbstractModel,
     belief: Belief,
@@ -187,7 +189,16 @@ def _position_error(
     wrench: Float[Array, "body 3"],
     next_state: State,
 ) -> FloatScalar:
-    """How far off the foretold positions are, on average over hypotheses [m]."""
+    """How far off the foretold positions are, on average over hypotheses [m].
+
+    Args:
+        key: for models that are random in themselves.
+        model: whose hypotheses are asked.
+        belief: these, and their weights.
+        state: before the step.
+        wrench: held over it [N, N, N m].
+        next_state: after it.
+    """
     foretold = jax.vmap(lambda each: model.transition(key, each, state, wrench))(
         belief.hypotheses
     )

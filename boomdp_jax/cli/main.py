@@ -35,6 +35,7 @@ AGENTS = (
     "gp",
     "ensemble",
     "physics-kinds",
+    "papers",
     "random",
 )
 """Agents of `run`."""

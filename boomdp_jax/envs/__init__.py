@@ -16,6 +16,7 @@ from boomdp_jax.envs.pendulum import Pendulum as Pendulum
 from boomdp_jax.envs.walls import Walls as Walls
 from boomdp_jax.envs.walls import stopped_at_walls as stopped_at_walls
 from boomdp_jax.envs.walls import walls_between as walls_between
+from boomdp_jax.envs.ways import way_to as way_to
 
 __all__ = [
     "AbstractEnvironment",
@@ -34,4 +35,5 @@ __all__ = [
     "stopped_at_walls",
     "stopped_by_boxes",
     "walls_between",
+    "way_to",
 ]

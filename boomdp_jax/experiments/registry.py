@@ -13,6 +13,7 @@ from boomdp_jax.envs.cart import Cart
 from boomdp_jax.envs.environment import AbstractEnvironment, EnvParams
 from boomdp_jax.envs.living_room import LivingRoom
 from boomdp_jax.envs.pendulum import Pendulum
+from boomdp_jax.experiments.papers_agent import papers_agent
 from boomdp_jax.experiments.recipes import RECIPES, Subject
 from boomdp_jax.experiments.room_agents import room_agent
 from boomdp_jax.experiments.teaching import NUM_SAMPLES, taught, unbiased_samples
@@ -31,9 +32,12 @@ TASKS: Mapping[str, MakeTask] = MappingProxyType(
 )
 """Each takes `num_steps`."""
 
-ROOM_AGENTS = ("physics-kinds",)
-"""Agents of the living room alone."""
-AGENTS = ("true", *RECIPES, *ROOM_AGENTS, "random")
+TASK_OF: Mapping[str, str] = MappingProxyType(
+    {"physics-kinds": "living-room", "papers": "cart"}
+)
+"""Agents that can do one task only: `physics-kinds` knows kinds of furniture, `papers`
+plans a path to an end for one body."""
+AGENTS = ("true", *RECIPES, *TASK_OF, "random")
 """Names of agents."""
 
 _CAPACITY, _NUM_PARTICLES = 128, 512
@@ -71,10 +75,10 @@ def check_agent(name: str, task: AbstractEnvironment) -> None:
     """
     if name not in AGENTS:
         raise ValueError(f"agent: expected one of {', '.join(AGENTS)}; got {name!r}")
-    if name in ROOM_AGENTS and not isinstance(task, LivingRoom):
+    only = TASK_OF.get(name, task.name)
+    if task.name != only:
         raise ValueError(
-            f"agent: expected one that can do the task {task.name}; {name} knows kinds "
-            "of furniture, for the task living-room alone"
+            f"agent: expected one that can do {task.name}; {name} does {only} alone"
         )
 
 
@@ -110,6 +114,8 @@ def agent_of(
         if name == "random":
             return random_agent(known, task.hints.action_repeat)
         return make_agent(name, task, known, params.goal, num_hypotheses=1)
+    if isinstance(task, Cart) and name == "papers":
+        return papers_agent(task, params)
     recipe = RECIPES[name]
     model = recipe.build(subject_of(task))
     if recipe.is_taught:

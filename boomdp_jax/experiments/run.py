@@ -7,6 +7,7 @@ same folder goes on where it stands; rewards, actions and states come out to the
 bits however often it was stopped and however many machines shared it.
 """
 
+import functools
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -15,11 +16,15 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float, PyTree
 
+from boomdp_jax.agents.agent import Agent
+from boomdp_jax.agents.compiled_episode import can_compile, compile_episode
 from boomdp_jax.agents.episode import EpisodeRecord, run_episode
-from boomdp_jax.core.arrays import on_device
+from boomdp_jax.core.arrays import Key, on_device
 from boomdp_jax.core.json_file import check_same, read_json, write_json
 from boomdp_jax.core.npz_file import read_npz, write_npz
+from boomdp_jax.envs.environment import AbstractEnvironment, EnvParams
 from boomdp_jax.experiments.registry import agent_of, check_agent, make_task
 from boomdp_jax.inference.posterior import library_versions
 
@@ -78,10 +83,14 @@ class Run(NamedTuple):
         begin = time.perf_counter()
         agent = agent_of(self.agent, task, params, reading_noise=noise)
         made = {MAKING: np.asarray(time.perf_counter() - begin)}
-        for seed in seeds:
-            record, _ = run_episode(
-                jax.random.key(seed), task, params, agent, reading_noise=noise
+        if can_compile(agent) and seeds:
+            episode = compile_episode(task, params, agent, reading_noise=noise)
+        else:
+            episode = functools.partial(
+                _looped, task=task, params=params, agent=agent, noise=noise
             )
+        for seed in seeds:
+            record, _ = episode(jax.random.key(seed))
             write_npz(self.path(seed), record._asdict() | made)
             if report is not None:
                 report(seed, record)
@@ -102,6 +111,18 @@ class Run(NamedTuple):
         }
         write_npz(self.folder / "results.npz", results)
         return results
+
+
+def _looped(
+    key: Key,
+    *,
+    task: AbstractEnvironment,
+    params: EnvParams,
+    agent: Agent,
+    noise: Float[Array, "4"] | None,
+) -> tuple[EpisodeRecord, PyTree]:
+    """An episode step by step, of a model that learns on the host."""
+    return run_episode(key, task, params, agent, reading_noise=noise)
 
 
 def begin_run(

@@ -6,6 +6,7 @@ from boomdp_jax.models.gaussian_process import GaussianProcess as GaussianProces
 from boomdp_jax.models.known_kinds import KnownKinds as KnownKinds
 from boomdp_jax.models.linear import LinearRegression as LinearRegression
 from boomdp_jax.models.locally_weighted import LocallyWeighted as LocallyWeighted
+from boomdp_jax.models.metropolis_model import MetropolisModel as MetropolisModel
 from boomdp_jax.models.model import AbstractModel as AbstractModel
 from boomdp_jax.models.neural_ensemble import NeuralEnsemble as NeuralEnsemble
 from boomdp_jax.models.object_among_others import (
@@ -35,6 +36,7 @@ __all__ = [
     "KnownKinds",
     "LinearRegression",
     "LocallyWeighted",
+    "MetropolisModel",
     "NeuralEnsemble",
     "ObjectAmongOthers",
     "ObjectOriented",
