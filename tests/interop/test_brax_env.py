@@ -26,7 +26,6 @@ NUM_WORLDS = 3
 TASKS = [
     pytest.param(Pendulum, id="pendulum"),
     pytest.param(Cart, id="cart", marks=pytest.mark.slow),
-    pytest.param(Acrobot, id="acrobot", marks=pytest.mark.slow),
 ]
 
 
