@@ -187,7 +187,28 @@ class AbstractEnvironment(abc.ABC):
             is: `terminal` (goal reached) or `truncated` (its time is up).
         """
         del key
-        wrench = self.actions[action].astype(state.physics.pose.dtype)
+        return self.push(state, self.actions[action], params)
+
+    def push(
+        self, state: EnvState, wrench: Float[Array, "body 3"], params: EnvParams
+    ) -> tuple[
+        Float[Array, " number"],
+        EnvState,
+        FloatScalar,
+        BoolScalar,
+        dict[str, BoolScalar],
+    ]:
+        """What `step` does, with any wrench.
+
+        Args:
+            state: now.
+            wrench: held over the step, at centres of mass [N, N, N m].
+            params: the world.
+
+        Returns:
+            As `step` does.
+        """
+        wrench = wrench.astype(state.physics.pose.dtype)
         moved = self.advance(params.physics, state.physics, wrench)
         reward = self.reward(state.physics, wrench, moved, params.goal)
         is_over = state.is_terminal
