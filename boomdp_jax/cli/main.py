@@ -18,7 +18,16 @@ LIKELIHOODS = ("auto", "filtered", "one-step", "open-loop")
 TASKS = ("pendulum", "cart", "acrobot", "living-room")
 """Tasks of `run`."""
 
-AGENTS = ("true", "physics", "lr", "lwr", "gp", "ensemble", "random")
+AGENTS = (
+    "true",
+    "physics",
+    "physics-residual",
+    "lr",
+    "lwr",
+    "gp",
+    "ensemble",
+    "random",
+)
 """Agents of `run`."""
 
 

@@ -18,6 +18,7 @@ from boomdp_jax.models.model import AbstractModel
 from boomdp_jax.models.neural_ensemble import NeuralEnsemble
 from boomdp_jax.models.physics_model import PhysicsModel
 from boomdp_jax.models.regression import AbstractRegressor, BodyRegression
+from boomdp_jax.models.residual_model import ResidualPhysics
 from boomdp_jax.models.true_model import TrueModel
 
 MakeTask = Callable[..., AbstractEnvironment]
@@ -40,12 +41,21 @@ _EXPLORATION = 0.1
 
 
 def _true(task: AbstractEnvironment, params: EnvParams) -> AbstractModel:
-    return TrueModel(params.physics, task.advance)
+    return TrueModel(params.physics, task.happens)
 
 
 def _physics(task: AbstractEnvironment, params: EnvParams) -> AbstractModel:
     online = OnlineBelief(task.spec, capacity=_CAPACITY, num_particles=_NUM_PARTICLES)
     return PhysicsModel(online, task.advance, task.moved_freely)
+
+
+def _residual(task: AbstractEnvironment, params: EnvParams) -> AbstractModel:
+    return ResidualPhysics(
+        _physics(task, params),
+        task.scene,
+        moved_freely=task.moved_freely,
+        halted=task.halted,
+    )
 
 
 def _regression(make: Callable[[], AbstractRegressor], frame: str) -> MakeModel:
@@ -73,6 +83,7 @@ _REGRESSIONS: dict[str, tuple[Callable[[], AbstractRegressor], str]] = {
 _MODELS: dict[str, tuple[MakeModel, int]] = {
     "true": (_true, 1),
     "physics": (_physics, _NUM_HYPOTHESES),
+    "physics-residual": (_residual, _NUM_HYPOTHESES),
     "lr": (_regression(*_REGRESSIONS["lr"]), 1),
     "lwr": (_regression(*_REGRESSIONS["lwr"]), 1),
     "gp": (_regression(*_REGRESSIONS["gp"]), 1),
@@ -84,26 +95,33 @@ AGENTS = (*_MODELS, "random")
 """Names of agents."""
 
 
-def make_task(name: str, num_steps: int | None = None) -> AbstractEnvironment:
+def make_task(
+    name: str, num_steps: int | None = None, world: str | None = None
+) -> AbstractEnvironment:
     """A task by its name.
 
     Args:
         name: one of `TASKS`.
         num_steps: of an episode; default: the task's own.
+        world: what is true instead of what agents are told, of `CART_WORLDS`; only the
+            cart has any. Default: nothing.
 
     Returns:
         The task.
 
     Raises:
-        ValueError: no such task, or fewer steps than one.
+        ValueError: no such task or world, or fewer steps than one.
     """
     if name not in TASKS:
         raise ValueError(f"task: expected one of {', '.join(TASKS)}; got {name!r}")
-    if num_steps is None:
-        return TASKS[name]()
-    if num_steps < 1:
+    if num_steps is not None and num_steps < 1:
         raise ValueError(f"num_steps: expected at least 1, got {num_steps}")
-    return TASKS[name](num_steps=num_steps)
+    if world is not None and name != "cart":
+        raise ValueError(f"world: expected none for {name}, got {world!r}")
+    options = {"num_steps": num_steps, "world": world}
+    return TASKS[name](
+        **{key: value for key, value in options.items() if value is not None}
+    )
 
 
 def check_agent(name: str) -> None:
@@ -128,10 +146,12 @@ def agent_of(name: str, task: AbstractEnvironment, params: EnvParams) -> Agent:
         The agent, which knows nothing yet.
 
     Raises:
-        ValueError: no such agent.
+        ValueError: no such agent, or none of this task.
     """
     check_agent(name)
     if isinstance(task, LivingRoom):
+        if name == "physics-residual":
+            raise ValueError(f"agent: expected one for the living room, got {name!r}")
         num = 1 if name == "random" else _MODELS[name][1]
         is_one_law = name in _REGRESSIONS and num == 1
         return room_agent(
