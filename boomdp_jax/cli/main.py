@@ -30,6 +30,9 @@ AGENTS = (
 )
 """Agents of `run`."""
 
+WORLDS = ("as-told", "dry", "off-centre", "caster", "large", "box")
+"""Worlds of the cart."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
@@ -159,6 +162,7 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("task", choices=TASKS)
     add("--agent", choices=AGENTS, required=True)
+    add("--world", choices=WORLDS, help="of the cart: what is not as agents are told")
     add("--seeds", type=_whole(1), default=20, metavar="N", help="episodes: 0 to N - 1")
     add("--steps", type=_whole(1), metavar="T", help="of each; default: the task's")
     add(

@@ -25,6 +25,7 @@ def run(arguments: argparse.Namespace) -> None:
         num_seeds=arguments.seeds,
         num_steps=arguments.steps,
         noise=arguments.noise,
+        world=arguments.world,
     )
     seeds = begun.missing(arguments.shard or (0, 1))
     num_done = begun.num_seeds - len(begun.missing())

@@ -36,6 +36,8 @@ class Run(NamedTuple):
     num_steps: int
     noise: tuple[float, float, float, float] | None
     """Standard deviation of the readings that are learnt from."""
+    world: str | None = None
+    """What is true instead of what agents are told; None: nothing."""
 
     def path(self, seed: int) -> Path:
         """File of one episode."""
@@ -67,7 +69,7 @@ class Run(NamedTuple):
             seeds: which.
             report: called with seed and record of each.
         """
-        task = make_task(self.task, self.num_steps)
+        task = make_task(self.task, self.num_steps, self.world)
         params = task.default_params()
         agent = agent_of(self.agent, task, params)
         noise = None if self.noise is None else on_device(self.noise)
@@ -105,6 +107,7 @@ def begin_run(
     num_seeds: int,
     num_steps: int | None = None,
     noise: Sequence[float] | None = None,
+    world: str | None = None,
 ) -> Run:
     """Begin a run in a folder, or take up one that was begun there.
 
@@ -116,6 +119,8 @@ def begin_run(
         num_steps: of each; default: the task's own.
         noise: standard deviation of the readings that agents learn from: position [m],
             angle [rad], velocity [m/s], spin [rad/s]; none: exact.
+        world: of the cart, what is true instead of what agents are told; default: the
+            task as it is.
 
     Returns:
         The run.
@@ -127,7 +132,7 @@ def begin_run(
     """
     if num_seeds < 1:
         raise ValueError(f"num_seeds: expected at least 1, got {num_seeds}")
-    made = make_task(task, num_steps)
+    made = make_task(task, num_steps, world)
     check_agent(agent)
     scale = None
     if noise is not None:
@@ -137,7 +142,7 @@ def begin_run(
                 "noise: expected four finite numbers of at least 0 (position, angle, "
                 f"velocity, spin), got {list(noise)}"
             )
-    run = Run(Path(folder), task, agent, num_seeds, made.num_steps, scale)
+    run = Run(Path(folder), task, agent, num_seeds, made.num_steps, scale, world)
     run.folder.mkdir(parents=True, exist_ok=True)
     content = {
         "schema": SCHEMA,
@@ -148,6 +153,8 @@ def begin_run(
         "noise": None if scale is None else list(scale),
         "versions": library_versions(),
     }
+    if world is not None:
+        content["world"] = world
     path = run.folder / "run.json"
     if path.exists():
         check_same(path, read_json(path, SCHEMA), content)
