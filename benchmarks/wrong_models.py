@@ -6,8 +6,8 @@ world; `physics` finds what its scene allows; `physics-residual` learns besides 
 that misses; `lwr` knows no physics. Of each: reward lost to `true`, steps until the
 mean reward stays within 5.4 % of its first value, and the error of one-step predictions
 with what was learnt in the episode, on a drive that nobody has seen, the same for all.
-Then `infer` is given what the `physics` agent saw of free motion: is it ok, and which
-law does it say that its model lacks?
+Then `infer` is given what the `physics` agent saw of free motion, and some rows of
+another drive at random: is it ok, and which law does it say that its model lacks?
 """
 
 from typing import NamedTuple
@@ -41,6 +41,8 @@ class Told(NamedTuple):
     task: Cart
     seen: list[History]
     """By the `physics` agent, of free motion, one for each seed."""
+    drive: History
+    """At random."""
 
 
 def main() -> None:
@@ -70,7 +72,8 @@ def report_world(reporter: Reporter, world: str, arguments) -> Told:
     """All agents in one world."""
     task = Cart(num_steps=arguments.steps, world=world)
     params = task.default_params()
-    rows = unseen_rows(task)
+    *rows, _ = random_drives(task, 1000)
+    drive = history_of(task, *random_drives(task, 2000))
     paid: float | None = None
     seen: list[History] = []
     for name in arguments.agents:
@@ -82,7 +85,7 @@ def report_world(reporter: Reporter, world: str, arguments) -> Told:
             belief = agent.model.sample(
                 jax.random.key(seed), learnt, agent.num_hypotheses
             )
-            errors.append(float(position_error(agent.model, belief, rows)))
+            errors.append(float(position_error(agent.model, belief, *rows)))
             if name == "physics":
                 seen.append(free_motion(task, record))
         reward = np.stack([record.reward for record in records])
@@ -104,7 +107,7 @@ def report_world(reporter: Reporter, world: str, arguments) -> Told:
             n=n,
             spread=[1e3 * float(q) for q in np.quantile(errors, (0.1, 0.9))],
         )
-    return Told(task, seen)
+    return Told(task, seen, drive)
 
 
 def report_rewards(
@@ -130,8 +133,12 @@ def report_rewards(
         )
 
 
-def unseen_rows(task: Cart) -> tuple[State, jax.Array, State]:
-    """Free motion of the world under actions drawn at random, each held a while."""
+def random_drives(task: Cart, seed: int) -> tuple[State, jax.Array, State, np.ndarray]:
+    """Free motion of the world under actions drawn at random, each held a while.
+
+    Returns:
+        States, wrenches, next states, `[row]`, and the run that a row belongs to.
+    """
     params = task.default_params()
 
     def drive(key):
@@ -146,21 +153,32 @@ def unseen_rows(task: Cart) -> tuple[State, jax.Array, State]:
 
         return jax.lax.scan(move, task.start(start_key, params), wrenches)[1]
 
-    keys = jax.random.split(jax.random.key(1000), _NUM_DRIVES)
-    found = jax.jit(jax.vmap(drive))(keys)
-    *rows, is_free = jax.tree.map(
-        lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), found
-    )
+    keys = jax.random.split(jax.random.key(seed), _NUM_DRIVES)
+    *rows, is_free = jax.tree.map(np.asarray, jax.jit(jax.vmap(drive))(keys))
+    # A run ends where its drive does, and where the cart was stopped.
+    stops = np.cumsum(~is_free, axis=1) + _DRIVE_STEPS * np.arange(_NUM_DRIVES)[:, None]
     before, wrench, after = jax.tree.map(lambda leaf: jnp.asarray(leaf[is_free]), rows)
-    return before, wrench, after
+    return before, wrench, after, stops[is_free]
+
+
+def history_of(
+    task: Cart, before: State, wrench: jax.Array, after: State, run: np.ndarray
+) -> History:
+    """The first rows, as many as there is room for."""
+    rows = (before.array, wrench, after.array)
+    return make_history(
+        *(np.asarray(leaf)[:_CAPACITY] for leaf in rows),
+        float(task.scene.dt),
+        episode=run[:_CAPACITY],
+        capacity=_CAPACITY,
+    )
 
 
 @eqx.filter_jit
 def position_error(
-    model: AbstractModel, belief: Belief, rows: tuple[State, jax.Array, State]
+    model: AbstractModel, belief: Belief, before: State, wrench: jax.Array, after: State
 ) -> jax.Array:
     """Root mean square over rows, mean over hypotheses [m]."""
-    before, wrench, after = rows
 
     def of(hypothesis):
         told = jax.vmap(
@@ -175,64 +193,67 @@ def position_error(
 def free_motion(task: Cart, record: EpisodeRecord) -> History:
     """What a model of the cart alone may learn from; runs end at every touch."""
     state = record.state[: record.num_done]
-    before, after = state[:-1], state[1:]
     wrench = np.asarray(task.actions.wrench)[record.action[1 : len(state)]]
-    moved_freely = jax.jit(jax.vmap(task.moved_freely))
-    is_free = np.asarray(
-        moved_freely(*(state_from_array(jnp.asarray(part)) for part in (before, after)))
-    )[:, 0]
-    run = np.cumsum(~is_free)
-    return make_history(
-        before[is_free],
-        wrench[is_free],
-        after[is_free],
-        float(task.scene.dt),
-        episode=run[is_free],
-        capacity=_CAPACITY,
+    before, after = (
+        state_from_array(jnp.asarray(part)) for part in (state[:-1], state[1:])
     )
+    is_free = np.asarray(jax.jit(jax.vmap(task.moved_freely))(before, after))[:, 0]
+    rows = jax.tree.map(
+        lambda leaf: leaf[is_free], (before, jnp.asarray(wrench), after)
+    )
+    return history_of(task, *rows, np.cumsum(~is_free)[is_free])
 
 
 def report_diagnostics(reporter: Reporter, told: dict[str, Told], num: int) -> None:
     """What `infer` says of what the `physics` agents saw."""
     cases = [
-        (world, task, history)
-        for world, (task, seen) in told.items()
-        for history in seen[:num]
+        (world, what, task, history)
+        for world, (task, seen, drive) in told.items()
+        for what, history in [("drive", drive), *(("episode", h) for h in seen[:num])]
         if int(history.num_transitions) >= FEWEST_ROWS
     ]
-    if not cases:
-        return
     posteriors = infer_batch(
-        jax.random.key(0), [task.spec for _, task, _ in cases], [h for *_, h in cases]
+        jax.random.key(0),
+        [task.spec for _, _, task, _ in cases],
+        [history for *_, history in cases],
     )
     for world in told:
-        mine = [
-            (posterior.diagnostics, int(history.num_transitions))
-            for posterior, (other, _, history) in zip(posteriors, cases, strict=True)
-            if other == world
-        ]
-        if not mine:
-            continue
-        named: dict[str, int] = {}
-        for diagnostics, _ in mine:
-            (entry,) = diagnostics["residual"]
-            for law in entry["laws"][:1]:
-                if law["log_bayes_factor"] > entry["threshold"]:
-                    named[law["law"]] = named.get(law["law"], 0) + 1
-        laws = ", ".join(f"{law} ({count})" for law, count in named.items())
-        rows = [count for _, count in mine]
-        reporter.report(
-            case=f"{world}: infer, {min(rows)} to {max(rows)} rows",
-            metric="share not ok",
-            value=float(np.mean([not diagnostics["ok"] for diagnostics, _ in mine])),
-            n=len(mine),
-        )
-        reporter.report(
-            case=f"{world}: infer, names {laws or 'no law'}",
-            metric="share of which a law is named that the model lacks",
-            value=sum(named.values()) / len(mine),
-            n=len(mine),
-        )
+        for what in ("drive", "episode"):
+            mine = [
+                (posterior.diagnostics, int(history.num_transitions))
+                for posterior, (*case, _, history) in zip(
+                    posteriors, cases, strict=True
+                )
+                if case == [world, what]
+            ]
+            if mine:
+                rows = [count for _, count in mine]
+                case = f"{world}: infer, {what} of {min(rows)} to {max(rows)} rows"
+                report_laws(reporter, case, [diagnostics for diagnostics, _ in mine])
+
+
+def report_laws(reporter: Reporter, case: str, found: list[dict]) -> None:
+    """How often something is said to be wrong, and what."""
+    n = len(found)
+    reporter.report(
+        case=case,
+        metric="share not ok",
+        value=float(np.mean([not diagnostics["ok"] for diagnostics in found])),
+        n=n,
+    )
+    named: dict[str, int] = {}
+    for diagnostics in found:
+        (entry,) = diagnostics["residual"]
+        for law in entry["laws"][:1]:
+            if law["log_bayes_factor"] > entry["threshold"]:
+                named[law["law"]] = named.get(law["law"], 0) + 1
+    laws = ", ".join(f"{law} {count} times" for law, count in named.items())
+    reporter.report(
+        case=f"{case}: {laws or 'no law'}",
+        metric="share of which a law is named that the model lacks",
+        value=sum(named.values()) / n,
+        n=n,
+    )
 
 
 if __name__ == "__main__":
