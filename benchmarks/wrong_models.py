@@ -10,6 +10,8 @@ Then `infer` is given what the `physics` agent saw of free motion, and some rows
 another drive at random: is it ok, and which law does it say that its model lacks?
 """
 
+import sys
+import time
 from typing import NamedTuple
 
 import _repository  # noqa: F401
@@ -82,6 +84,11 @@ def report_world(reporter: Reporter, world: str, arguments) -> Told:
         for seed in range(arguments.seeds):
             record, learnt = run_episode(jax.random.key(seed), task, params, agent)
             records.append(record)
+            print(
+                f"{world}, {name}, seed {seed}: {record.num_done} steps, "
+                f"return {record.reward.sum():.1f}, {time.process_time():.0f} s so far",
+                file=sys.stderr,
+            )
             belief = agent.model.sample(
                 jax.random.key(seed), learnt, agent.num_hypotheses
             )

@@ -60,6 +60,7 @@ def test_dry_wheels_and_floor_brake_at_a_constant_rate():
     assert abs(ahead) < 0.02
 
 
+@pytest.mark.slow
 def test_a_caster_drags_with_a_constant_force_besides():
     ratio, speed = CASTER_DRY / VISCOUS[0], 1.5
     decay = np.exp(-VISCOUS[0] * STEP / MASS)
@@ -68,6 +69,7 @@ def test_a_caster_drags_with_a_constant_force_besides():
     np.testing.assert_allclose([across, spin], 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_push_turns_a_cart_that_is_heavier_on_one_side():
     assert after_a_step("as-told", 0.0, 20.0)[2] == pytest.approx(0.0, abs=1e-12)
     spin = after_a_step("off-centre", 0.0, 20.0)[2]
@@ -89,6 +91,7 @@ def test_wrong_outlines_are_told_about_the_same_centroid():
         )
 
 
+@pytest.mark.slow
 def test_walls_stop_the_true_outline_and_not_the_told_one():
     task = Cart(world="large")
     physics = task.default_params().physics
@@ -107,6 +110,7 @@ def test_walls_stop_the_true_outline_and_not_the_told_one():
     assert float(true.pose[0, 0]) < float(told.pose[0, 0]) - 0.04
 
 
+@pytest.mark.slow
 def test_starts_are_clear_in_every_world():
     for name in CART_WORLDS:
         task = Cart(world=name)
