@@ -24,6 +24,7 @@ AGENTS = (
     "physics-map",
     "physics-informative",
     "physics-pretrained",
+    "physics-residual",
     "point-fit",
     "cma-es",
     "lr",
@@ -39,6 +40,9 @@ AGENTS = (
     "random",
 )
 """Agents of `run`."""
+
+WORLDS = ("as-told", "dry", "off-centre", "caster", "large", "box")
+"""Worlds of the cart."""
 
 
 FIGURES = (
@@ -186,6 +190,7 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("task", choices=TASKS)
     add("--agent", choices=AGENTS, required=True)
+    add("--world", choices=WORLDS, help="of the cart: what is not as agents are told")
     add("--seeds", type=_whole(1), default=20, metavar="N", help="episodes: 0 to N - 1")
     add("--steps", type=_whole(1), metavar="T", help="of each; default: the task's")
     add(

@@ -25,6 +25,7 @@ def run(arguments: argparse.Namespace) -> None:
         num_seeds=arguments.seeds,
         num_steps=arguments.steps,
         noise=arguments.noise,
+        world=arguments.world,
     )
     results = fill(begun, arguments.shard)
     if results is None:

@@ -7,6 +7,8 @@ from boomdp_jax.envs.action_set import join_actions as join_actions
 from boomdp_jax.envs.blocking import Boxes as Boxes
 from boomdp_jax.envs.blocking import stopped_by_boxes as stopped_by_boxes
 from boomdp_jax.envs.cart import Cart as Cart
+from boomdp_jax.envs.cart_worlds import CART_WORLDS as CART_WORLDS
+from boomdp_jax.envs.cart_worlds import CartWorld as CartWorld
 from boomdp_jax.envs.environment import AbstractEnvironment as AbstractEnvironment
 from boomdp_jax.envs.environment import EnvParams as EnvParams
 from boomdp_jax.envs.environment import EnvState as EnvState
@@ -19,11 +21,13 @@ from boomdp_jax.envs.walls import walls_between as walls_between
 from boomdp_jax.envs.ways import way_to as way_to
 
 __all__ = [
+    "CART_WORLDS",
     "AbstractEnvironment",
     "Acrobot",
     "ActionSet",
     "Boxes",
     "Cart",
+    "CartWorld",
     "EnvParams",
     "EnvState",
     "LivingRoom",

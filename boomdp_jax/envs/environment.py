@@ -122,6 +122,28 @@ class AbstractEnvironment(abc.ABC):
         What is learnt of a body's own numbers should rest on such steps alone.
         """
 
+    def happens(
+        self, physics: Params, state: State, wrench: Float[Array, "body 3"]
+    ) -> State:
+        """One step of the world itself.
+
+        That of `advance`, unless agents are told something that is not true.
+        """
+        return self.advance(physics, state, wrench)
+
+    def halted(self, state: State, next_state: State) -> State:
+        """Where a step ends that might run into something, as agents know it.
+
+        Args:
+            state: before.
+            next_state: after, as if nothing were in the way.
+
+        Returns:
+            The next state; the very same unless a task has things that stop bodies.
+        """
+        del state
+        return next_state
+
     @property
     def scene(self) -> Scene:
         """Arrays of `spec`, concrete even while something is traced."""
@@ -209,7 +231,7 @@ class AbstractEnvironment(abc.ABC):
             As `step` does.
         """
         wrench = wrench.astype(state.physics.pose.dtype)
-        moved = self.advance(params.physics, state.physics, wrench)
+        moved = self.happens(params.physics, state.physics, wrench)
         reward = self.reward(state.physics, wrench, moved, params.goal)
         is_over = state.is_terminal
         moved = jax.tree.map(

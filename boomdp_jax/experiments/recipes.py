@@ -17,6 +17,7 @@ from boomdp_jax.models.per_body import MovedFreely
 from boomdp_jax.models.physics_model import PhysicsModel
 from boomdp_jax.models.point_fit import AbstractSearch, CmaEs, GaussNewton, PointFit
 from boomdp_jax.models.regression import AbstractRegressor, BodyRegression
+from boomdp_jax.models.residual_model import Halted, ResidualPhysics
 from boomdp_jax.models.true_model import Advance
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.scene_spec import SceneSpec
@@ -35,6 +36,8 @@ class Subject(NamedTuple):
     advance: Advance
     """A step under a hypothesis, walls included."""
     moved_freely: MovedFreely | None
+    halted: Halted | None
+    """Where a step ends that might run into something; None: nothing is known of it."""
     is_bob: bool
     """Seen without its angle, as the papers' pendulum: x, y and their rates."""
     surroundings: tuple[Scene, Float[Array, "other 3"]]
@@ -79,6 +82,15 @@ def _physics_model(subject: Subject, *, is_point: bool = False) -> PhysicsModel:
     )
     return PhysicsModel(
         online, subject.advance, subject.moved_freely, is_point=is_point
+    )
+
+
+def _residual(subject: Subject) -> AbstractModel:
+    return ResidualPhysics(
+        _physics_model(subject),
+        subject.spec.scene,
+        moved_freely=subject.moved_freely,
+        halted=subject.halted,
     )
 
 
@@ -132,6 +144,7 @@ RECIPES: Mapping[str, Recipe] = MappingProxyType(
         "physics-map": Recipe(_most_probable),
         "physics-informative": Recipe(_physics, _NUM_HYPOTHESES, is_curious=True),
         "physics-pretrained": Recipe(_taught_physics, _NUM_HYPOTHESES, is_taught=True),
+        "physics-residual": Recipe(_residual, _NUM_HYPOTHESES),
         "point-fit": _one_law(_point_fit(GaussNewton)),
         "cma-es": _one_law(_point_fit(CmaEs)),
         "lr": _one_law(_regression(lambda _: LinearRegression(), "world")),

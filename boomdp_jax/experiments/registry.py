@@ -37,6 +37,8 @@ TASK_OF: Mapping[str, str] = MappingProxyType(
 )
 """Agents that can do one task only: `physics-kinds` knows kinds of furniture, `papers`
 plans a path to an end for one body."""
+_NOT_IN_ROOM = ("physics-residual",)
+"""Agents that cannot do the living room, where models are piece by piece."""
 AGENTS = ("true", *RECIPES, *TASK_OF, "random")
 """Names of agents."""
 
@@ -45,26 +47,33 @@ _TEACHING = 2013
 """Folded into a key for what is taught, so that it is no episode's."""
 
 
-def make_task(name: str, num_steps: int | None = None) -> AbstractEnvironment:
+def make_task(
+    name: str, num_steps: int | None = None, world: str | None = None
+) -> AbstractEnvironment:
     """A task by its name.
 
     Args:
         name: one of `TASKS`.
         num_steps: of an episode; default: the task's own.
+        world: what is true instead of what agents are told, of `CART_WORLDS`; only the
+            cart has any. Default: nothing.
 
     Returns:
         The task.
 
     Raises:
-        ValueError: no such task, or fewer steps than one.
+        ValueError: no such task or world, or fewer steps than one.
     """
     if name not in TASKS:
         raise ValueError(f"task: expected one of {', '.join(TASKS)}; got {name!r}")
-    if num_steps is None:
-        return TASKS[name]()
-    if num_steps < 1:
+    if num_steps is not None and num_steps < 1:
         raise ValueError(f"num_steps: expected at least 1, got {num_steps}")
-    return TASKS[name](num_steps=num_steps)
+    if world is not None and name != "cart":
+        raise ValueError(f"world: expected none for {name}, got {world!r}")
+    options = {"num_steps": num_steps, "world": world}
+    return TASKS[name](
+        **{key: value for key, value in options.items() if value is not None}
+    )
 
 
 def check_agent(name: str, task: AbstractEnvironment) -> None:
@@ -79,6 +88,10 @@ def check_agent(name: str, task: AbstractEnvironment) -> None:
     if task.name != only:
         raise ValueError(
             f"agent: expected one that can do {task.name}; {name} does {only} alone"
+        )
+    if isinstance(task, LivingRoom) and name in _NOT_IN_ROOM:
+        raise ValueError(
+            f"agent: expected one that can do {task.name}, piece by piece; got {name!r}"
         )
 
 
@@ -110,7 +123,7 @@ def agent_of(
     if isinstance(task, LivingRoom):
         return room_agent(name, task, params, teaching_key, reading_noise)
     if name in ("true", "random"):
-        known = TrueModel(params.physics, task.advance)
+        known = TrueModel(params.physics, task.happens)
         if name == "random":
             return random_agent(known, task.hints.action_repeat)
         return make_agent(name, task, known, params.goal, num_hypotheses=1)
@@ -143,6 +156,7 @@ def subject_of(task: AbstractEnvironment) -> Subject:
         spec=task.spec,
         advance=task.advance,
         moved_freely=task.moved_freely,
+        halted=task.halted,
         is_bob=task.name == "pendulum",
         surroundings=task.surroundings,
         capacity=_CAPACITY,

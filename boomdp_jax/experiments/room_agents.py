@@ -143,6 +143,7 @@ def _subject(spec: SceneSpec) -> Subject:
         spec=spec,
         advance=_advance(spec),
         moved_freely=None,
+        halted=None,
         is_bob=False,
         surroundings=(spec.scene, jnp.zeros((0, 3))),
         capacity=_CAPACITY,

@@ -46,6 +46,8 @@ class Run(NamedTuple):
     num_steps: int
     noise: tuple[float, float, float, float] | None
     """Standard deviation of the readings that are learnt from."""
+    world: str | None = None
+    """What is true instead of what agents are told; None: nothing."""
 
     def path(self, seed: int) -> Path:
         """File of one episode."""
@@ -77,7 +79,7 @@ class Run(NamedTuple):
             seeds: which.
             report: called with seed and record of each.
         """
-        task = make_task(self.task, self.num_steps)
+        task = make_task(self.task, self.num_steps, self.world)
         params = task.default_params()
         noise = None if self.noise is None else on_device(self.noise)
         begin = time.perf_counter()
@@ -133,6 +135,7 @@ def begin_run(
     num_seeds: int,
     num_steps: int | None = None,
     noise: Sequence[float] | None = None,
+    world: str | None = None,
 ) -> Run:
     """Begin a run in a folder, or take up one that was begun there.
 
@@ -144,6 +147,8 @@ def begin_run(
         num_steps: of each; default: the task's own.
         noise: standard deviation of the readings that agents learn from: position [m],
             angle [rad], velocity [m/s], spin [rad/s]; none: exact.
+        world: of the cart, what is true instead of what agents are told; default: the
+            task as it is.
 
     Returns:
         The run.
@@ -155,7 +160,7 @@ def begin_run(
     """
     if num_seeds < 1:
         raise ValueError(f"num_seeds: expected at least 1, got {num_seeds}")
-    made = make_task(task, num_steps)
+    made = make_task(task, num_steps, world)
     check_agent(agent, made)
     scale = None
     if noise is not None:
@@ -165,7 +170,7 @@ def begin_run(
                 "noise: expected four finite numbers of at least 0 (position, angle, "
                 f"velocity, spin), got {list(noise)}"
             )
-    run = Run(Path(folder), task, agent, num_seeds, made.num_steps, scale)
+    run = Run(Path(folder), task, agent, num_seeds, made.num_steps, scale, world)
     run.folder.mkdir(parents=True, exist_ok=True)
     content = {
         "schema": SCHEMA,
@@ -176,6 +181,8 @@ def begin_run(
         "noise": None if scale is None else list(scale),
         "versions": library_versions(),
     }
+    if world is not None:
+        content["world"] = world
     path = run.folder / "run.json"
     if path.exists():
         check_same(path, read_json(path, SCHEMA), content)

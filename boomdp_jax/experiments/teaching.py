@@ -109,7 +109,7 @@ def _rollout(
     def advance(number: Array, states: tuple[State, State]) -> tuple[State, State]:
         state = states[1]
         wrench = task.actions[pushes[number // num_held]].astype(state.pose.dtype)
-        return state, task.advance(params.physics, state, wrench)
+        return state, task.happens(params.physics, state, wrench)
 
     def block(state: State, number: Array) -> tuple[State, tuple[Array, ...]]:
         first = number * _EVERY

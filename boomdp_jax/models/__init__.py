@@ -22,6 +22,7 @@ from boomdp_jax.models.point_fit import GaussNewton as GaussNewton
 from boomdp_jax.models.point_fit import PointFit as PointFit
 from boomdp_jax.models.regression import AbstractRegressor as AbstractRegressor
 from boomdp_jax.models.regression import BodyRegression as BodyRegression
+from boomdp_jax.models.residual_model import ResidualPhysics as ResidualPhysics
 from boomdp_jax.models.true_model import TrueModel as TrueModel
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "PerBody",
     "PhysicsModel",
     "PointFit",
+    "ResidualPhysics",
     "ScenePhysics",
     "TrueModel",
     "touched_sectors",
