@@ -59,8 +59,10 @@ def way_to(
     way = np.full(counts, np.inf)
     way[at] = 0.0
     way = _relaxed(way, is_open, np.ones(counts))
-    # Out of a margin ways lead too, and cost more there.
-    way = _relaxed(way, np.ones(counts, bool), np.where(is_open, 1.0, _DEAR)) * spacing
+    # From within a margin ways lead out; none leads through.
+    way = _relaxed(way, ~is_open, np.full(counts, _DEAR))
+    # A place that is walled in is farther than all others.
+    way = spacing * np.where(np.isfinite(way), way, 2 * way[np.isfinite(way)].max())
     table = jnp.asarray(way, float)
 
     def length(place: Float[Array, "2"]) -> FloatScalar:

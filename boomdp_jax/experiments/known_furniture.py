@@ -86,7 +86,7 @@ def fitted_to(draws: Params, kind: Piece, piece: Piece) -> Params:
         draws,
         wheel=dataclasses.replace(
             wheel,
-            position=wheel.position * sides,
+            position=_times(wheel.position, sides),
             viscous=wheel.viscous * mass,
             dry=wheel.dry * mass,
             half_track=None if track is None else track * float(np.sqrt(mass)),
@@ -94,13 +94,20 @@ def fitted_to(draws: Params, kind: Piece, piece: Piece) -> Params:
         ground=dataclasses.replace(
             ground,
             viscous=ground.viscous * mass,
-            load_shift=None if shift is None else shift * sides,
+            load_shift=None if shift is None else _times(shift, sides),
         ),
-        revolute=dataclasses.replace(pins, anchor_a=pins.anchor_a * sides),
+        revolute=dataclasses.replace(pins, anchor_a=_times(pins.anchor_a, sides)),
     )
     at_start = State(start, jnp.zeros_like(start))
     fitted = jax.vmap(lambda one: pinned_where_it_is(one, at_start))(fitted)
     return jax.tree.map(lambda new, old: new.astype(old.dtype), fitted, draws)
+
+
+def _times(
+    places: Float[Array, "*any 2"], sides: Float[np.ndarray, "2"]
+) -> Float[Array, "*any 2"]:
+    """Each coordinate by its own factor."""
+    return places * sides.reshape((1,) * (places.ndim - 1) + (2,))
 
 
 def _learnt(

@@ -81,6 +81,16 @@ def test_another_run_does_not_go_into_the_folder(whole):
             "task: expected one of pendulum, cart, acrobot, living-room; got",
         ),
         (("cart", "lucky"), {}, "agent: expected one of true, physics"),
+        (
+            ("cart", "physics-kinds"),
+            {},
+            "agent: expected one that can do cart; physics-kinds does living-room al",
+        ),
+        (
+            ("pendulum", "papers"),
+            {},
+            "agent: expected one that can do pendulum; papers does cart alone",
+        ),
         (("cart", "true"), {"num_seeds": 0}, "num_seeds: expected at least 1, got 0"),
         (("cart", "true"), {"num_steps": 0}, "num_steps: expected at least 1, got 0"),
         (
@@ -142,7 +152,7 @@ def test_the_command_line_runs_and_goes_on(tmp_path, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in AGENTS if name != "physics"])
+@pytest.mark.parametrize("name", ["true", "lr", "oo-lwr", "gp", "ensemble", "random"])
 def test_every_agent_acts_on_the_cart(name):
     task = make_task("cart", 8)
     params = task.default_params()
