@@ -238,7 +238,8 @@ def _add_view(parser: argparse.ArgumentParser) -> None:
     add(
         "data",
         metavar="DATA.npz|DIR",
-        help="planar-transitions-1, or a folder with scene.json and such files",
+        help="planar-transitions-1, a folder with scene.json and such files, or what"
+        " run wrote",
     )
     add("--scene", metavar="SCENE.json", help="outlines; required of a data file")
     add(

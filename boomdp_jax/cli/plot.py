@@ -5,6 +5,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from boomdp_jax.cli.output import check_figure, print_json
 from boomdp_jax.experiments.scores import (
     MARKS,
@@ -95,7 +97,7 @@ def _table(first: LoadedRun, found: list[Score]) -> list[str]:
         lines.append(
             f"{score.agent:<32} {score.num_seeds:>5} {score.total:>9.1f} "
             f"{score.total_error:>7.1f} {regret:>7} {_steps(score.marks)} "
-            f"{1e3 * score.decision:>5.0f} ms {1e3 * score.learning:>5.0f} ms"
+            f"{_milliseconds(score.decision)} {_milliseconds(score.learning)}"
         )
     for published in PUBLISHED.get(first.setting, ()):
         lines.append(
@@ -107,3 +109,8 @@ def _table(first: LoadedRun, found: list[Score]) -> list[str]:
 
 def _steps(marks: tuple[int | None, ...]) -> str:
     return " ".join(f"{'-' if step is None else step:>7}" for step in marks)
+
+
+def _milliseconds(seconds: float) -> str:
+    """Eight characters; an episode that is one program has no time of its own parts."""
+    return f"{'-':>8}" if np.isnan(seconds) else f"{1e3 * seconds:>5.0f} ms"

@@ -10,6 +10,7 @@ papers' the truth differs from what agents are told (`cart_worlds`).
 """
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -85,9 +86,8 @@ def cart_scene(*, is_known: bool, world: CartWorld | None = None) -> SceneSpec:
         The scene; a centre of mass elsewhere is not in it (`Cart.default_params`).
     """
     world = world or CartWorld()
-    wheel = {"type": "wheel", "a": "cart", "pose": [AXLE, 0.0, 0.0], **world.wheel}
     unknown = {"unknown": {"revolute": 1, "wheel": 1}, "prior": VISCOUS_PRIOR}
-    known = {"constraints": [wheel, *map(dict, world.more)]}
+    known = {"constraints": [_wheel(world), *map(dict, world.more)]}
     outline = CART_OUTLINE if is_known else world.told(CART_OUTLINE)
     return scene_spec_from_dict(
         {
@@ -111,8 +111,13 @@ def cart_scene(*, is_known: bool, world: CartWorld | None = None) -> SceneSpec:
     )
 
 
+def _wheel(world: CartWorld) -> dict[str, Any]:
+    """Both of the cart's fixed wheels as one constraint."""
+    return {"type": "wheel", "a": "cart", "pose": [AXLE, 0.0, 0.0], **world.wheel}
+
+
 def _walled_scene() -> SceneSpec:
-    """Outlines of the cart and, as static boxes, of the walls."""
+    """The cart on its wheels and, as static boxes, the walls: for pictures."""
     walls = walls_between(np.array(ROOM))
     boxes = [
         {
@@ -137,6 +142,7 @@ def _walled_scene() -> SceneSpec:
             "gravity": [0.0, 0.0],
             "dt": _TIME_STEP,
             "bodies": [cart, *boxes],
+            "constraints": [_wheel(CartWorld())],
         },
         "cart among walls",
     )
@@ -176,12 +182,17 @@ class Cart(AbstractEnvironment):
         )
 
     @property
+    def seen_spec(self) -> SceneSpec:
+        """The cart among its walls."""
+        return _walled_scene()
+
+    @property
     def surroundings(self) -> tuple[Scene, Float[Array, "other 3"]]:
         """The cart among its walls, and where these are."""
         with jax.ensure_compile_time_eval():
             middle = self.walls.middle
             pose = jnp.concatenate([middle, jnp.zeros_like(middle[:, :1])], axis=1)
-            return _walled_scene().scene, pose
+            return self.seen_spec.scene, pose
 
     def default_params(self) -> EnvParams:
         """Starts within a quarter of a metre and in any direction."""

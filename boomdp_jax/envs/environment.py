@@ -151,6 +151,11 @@ class AbstractEnvironment(abc.ABC):
             return self.spec.scene
 
     @property
+    def seen_spec(self) -> SceneSpec:
+        """The scene of `surroundings`, for pictures."""
+        return self.spec
+
+    @property
     def surroundings(self) -> tuple[Scene, Float[Array, "other 3"]]:
         """All that can be seen, and poses of what states do not tell of, such as walls.
 

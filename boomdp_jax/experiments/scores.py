@@ -75,7 +75,7 @@ class LoadedRun(NamedTuple):
     decision: float
     """Median time of a decision [s]."""
     learning: float
-    """Mean time of learning from a step [s]."""
+    """Mean time of learning from a step [s]; NaN where `decision` counts it in."""
     world: str | None = None
     """What was true instead of what agents are told."""
 
