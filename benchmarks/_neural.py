@@ -5,10 +5,11 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _plain_samplers import PlainResult, as_posterior, plain_problem
+from _plain_samplers import PlainResult, as_posterior
 
 from boomdp_jax.core.history import History
-from boomdp_jax.inference.one_step import readings, residuals
+from boomdp_jax.inference.one_step import residuals
+from boomdp_jax.inference.plain_problem import plain_problem
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 # Differences from the readings enter as they are below this, beyond it by logarithms:
@@ -37,18 +38,15 @@ def neural_posterior(
     from sbi.neural_nets import posterior_nn
     from sbi.neural_nets.embedding_nets import FCEmbedding
 
-    problem = plain_problem(spec, history)
-    coordinates = problem.block.target.log_likelihood.coordinates
-    structures = problem.block.target.structures
-    data = readings(history, (0,), True)
+    block, problem = plain_problem(spec, history)
+    data = problem.data
 
     def simulate(key):
         """A hypothesis, and what would be read less what was."""
         draw_key, noise_key = jax.random.split(key)
         x = problem.draw(draw_key)
-        structure, z, sigma = problem.split(x)
-        params = coordinates(z, structures[jnp.maximum(structure, 0)])
-        error = residuals(coordinates.scene, params, data)
+        structure, _, sigma = problem.split(x)
+        error = residuals(problem.coordinates.scene, problem.params(x), data)
         noise = sigma * jax.random.normal(noise_key, error.shape)
         features = jnp.arcsinh((error + noise * data.mask) / _SCALE).reshape(-1)
         return x, features, (structure >= 0) & jnp.all(jnp.isfinite(features))
@@ -89,11 +87,5 @@ def neural_posterior(
         raise RuntimeError("npe: expected draws within the prior's support, got none")
     draws = np.resize(draws[:_NUM_KEPT], (4, _NUM_KEPT // 4, problem.size))
     seconds = {"compile": middle - start, "run": time.perf_counter() - middle}
-
-    def log_density(x):
-        return problem.log_prior(x) + problem.log_likelihood(x)
-
-    posterior = as_posterior(
-        problem, spec, jnp.asarray(draws), log_density, seconds, "npe"
-    )
+    posterior = as_posterior(block, problem, spec, jnp.asarray(draws), seconds, "npe")
     return PlainResult(posterior, num_simulations * problem.calls_each, seconds)

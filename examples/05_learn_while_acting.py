@@ -18,13 +18,8 @@ quarter of an hour; `--quick` runs a short cart episode of agents that compile s
 import argparse
 import pathlib
 
-import jax.numpy as jnp
-
 from boomdp_jax.cli.main import main
-from boomdp_jax.core.npz_file import read_npz
-from boomdp_jax.experiments import AGENTS, TASKS, make_task
-from boomdp_jax.physics import State
-from boomdp_jax.viz import animate
+from boomdp_jax.experiments import AGENTS, TASKS
 
 parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
 parser.add_argument("--task", choices=list(TASKS), default="cart")
@@ -58,17 +53,8 @@ if status:
     raise SystemExit(status)
 
 # %% A film of the last agent's first episode
-record = read_npz(pathlib.Path(folders[-1]) / "seed-00000.npz")
-task = make_task(arguments.task, num_steps)
-world = task.default_params().physics
-states = record["state"][record["action"] >= 0]
 film = arguments.out / f"{arguments.task}-{agents[-1]}.gif"
-animate(
-    task.spec,
-    State(jnp.asarray(states[..., :3]), jnp.asarray(states[..., 3:])),
-    film,
-    params=world,
-    title=f"{arguments.task}, {agents[-1]}",
-    has_trail=True,
-)
+status = main(["view", folders[-1], "--out", str(film)])
+if status:
+    raise SystemExit(status)
 print(film)

@@ -1,18 +1,43 @@
 """Set-up of every test: 64 bit, ranks that never broadcast silently, checked shapes."""
 
+import contextlib
 import gc
+import os
+import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import NamedTuple
 
-import jax
-import pytest
-from jaxtyping import install_import_hook
+# Most of the time of a test is that of the compiler. What one file compiled is there
+# for others, for programs that tests start, and for the next run; set in the
+# environment, before JAX reads it.
+_PROGRAMS = Path(__file__).parents[1] / ".pytest_cache" / "xla"
+_MOST_DAYS = 14
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_PROGRAMS))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+# XLA takes its own tuning flags for features that the machine lacks, and says so at
+# length of each program that it loads.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+import jax  # noqa: E402
+import pytest  # noqa: E402
+from jaxtyping import install_import_hook  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 install_import_hook("boomdp_jax", "beartype.beartype")
 
 from boomdp_jax.core import side_by_side  # noqa: E402  After the hook.
+
+
+def pytest_sessionstart() -> None:
+    """Forget programs of weeks ago; JAX would keep them for ever."""
+    oldest = time.time() - _MOST_DAYS * 86400
+    for path in _PROGRAMS.glob("*"):
+        # Another worker may be at it too.
+        with contextlib.suppress(FileNotFoundError):
+            if path.stat().st_mtime < oldest:
+                path.unlink()
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from boomdp_jax.core.arrays import IntScalar, Key
 from boomdp_jax.envs.environment import AbstractEnvironment
@@ -18,6 +18,10 @@ from boomdp_jax.planning.sparse_sampling import sparse_sampling
 
 PlanFn = Callable[[Key, Any, State, Plan | None], Plan]
 """`(key, belief, state, plan of the decision before)` to a plan."""
+
+ExploreFn = Callable[[Key, Any, State, IntScalar], int | None]
+"""`(key, learnt, state, planned action)` to an action to do instead, or none; on the
+host."""
 
 
 class Agent(eqx.Module):
@@ -39,6 +43,8 @@ class Agent(eqx.Module):
     """Probability that a decision is any action instead of the planned one. Who learns
     one law and no distribution over laws needs it: what is never tried is never
     learnt."""
+    explore: ExploreFn | None = eqx.field(static=True, default=None)
+    """What may be done instead of the planned action, for what it tells."""
 
     def decide(
         self,
@@ -47,6 +53,7 @@ class Agent(eqx.Module):
         state: State,
         previous: Plan | None,
         num_actions: int,
+        learnt: PyTree = None,
     ) -> tuple[IntScalar, Plan | None]:
         """Choose an action.
 
@@ -56,9 +63,11 @@ class Agent(eqx.Module):
             state: as read.
             previous: the plan of the decision before, if it was carried out.
             num_actions: of the task.
+            learnt: by the model, for those who explore by it.
 
         Returns:
-            Index of the action, and the plan it is from; none, if it is from chance.
+            Index of the action, and the plan it is from; none, if it is from chance or
+            for what it tells.
         """
         key, try_key, any_key = jax.random.split(key, 3)
         tries = self.exploration > 0 and bool(
@@ -67,6 +76,10 @@ class Agent(eqx.Module):
         if self.plan is None or tries:
             return jax.random.randint(any_key, (), 0, num_actions), None
         plan = self.plan(key, belief, state, previous)
+        if self.explore is not None:
+            told = self.explore(any_key, learnt, state, plan.index)
+            if told is not None:
+                return jnp.asarray(told, plan.index.dtype), None
         return plan.index, plan
 
 
@@ -80,6 +93,7 @@ def make_agent(
     capacity: int | None = None,
     exploration: float = 0.0,
     has_leaf: bool = True,
+    explore: ExploreFn | None = None,
 ) -> Agent:
     """An agent that plans with sparse sampling, by a task's own hints.
 
@@ -92,6 +106,7 @@ def make_agent(
         capacity: nodes of a level; default: the task's hint.
         exploration: probability that a decision is any action.
         has_leaf: whether the task's leaf value is used, or zero.
+        explore: what may be done instead of the planned action.
 
     Returns:
         The agent.
@@ -153,6 +168,7 @@ def make_agent(
         num_hypotheses=num_hypotheses,
         num_held=hints.action_repeat,
         exploration=float(exploration),
+        explore=explore,
     )
 
 

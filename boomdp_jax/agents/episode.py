@@ -38,8 +38,10 @@ class EpisodeRecord(NamedTuple):
     is, with what was learnt up to the decision: root mean square over bodies, mean over
     hypotheses [m]."""
     plan_seconds: Float[np.ndarray, " step"]
-    """Of sampling hypotheses and planning; zero where a decision was carried on."""
+    """Of sampling hypotheses and planning; zero where a decision was carried on. Of an
+    episode compiled whole, its time in equal parts, learning included."""
     learn_seconds: Float[np.ndarray, " step"]
+    """Not a number in an episode compiled whole, where it cannot be told."""
 
     @property
     def num_done(self) -> int:
@@ -82,7 +84,7 @@ def run_episode(
     scale = jnp.zeros(4) if reading_noise is None else jnp.asarray(reading_noise)
     noise_keys = jax.random.split(noise_key, task.num_steps + 1)
     act_keys = jax.random.split(act_key, task.num_steps)
-    reading = _read(noise_keys[0], now.physics, scale)
+    reading = read_state(noise_keys[0], now.physics, scale)
     record = _empty_record(task.num_steps, now.physics.pose.shape[0])
     is_compiled = agent.model.is_compiled
     sample = _compiled_sample if is_compiled else _sample
@@ -96,14 +98,14 @@ def run_episode(
             belief_key, plan_key = jax.random.split(act_keys[step])
             belief = sample(agent.model, belief_key, learnt, agent.num_hypotheses)
             chosen, plan = agent.decide(
-                plan_key, belief, now.physics, plan, task.num_actions
+                plan_key, belief, now.physics, plan, task.num_actions, learnt
             )
             index, num_left = int(chosen), agent.num_held
             record.plan_seconds[step] = time.perf_counter() - begin
         before = now.physics
         _, now, reward, _, _ = compiled.step(None, now, index, params)
-        next_reading = _read(noise_keys[step + 1], now.physics, scale)
-        error = _position_error(
+        next_reading = read_state(noise_keys[step + 1], now.physics, scale)
+        error = position_error(
             act_keys[step],
             agent.model,
             belief,
@@ -164,15 +166,22 @@ _compiled_sample, _compiled_update = eqx.filter_jit(_sample), eqx.filter_jit(_up
 
 
 @jax.jit
-def _read(key: Key, state: State, scale: Float[Array, "4"]) -> State:
-    """A reading of a state; exact where the scale is zero."""
+def read_state(key: Key, state: State, scale: Float[Array, "4"]) -> State:
+    """A reading of a state; exact where the scale is zero.
+
+    Args:
+        key: random key.
+        state: as it is.
+        scale: standard deviation of position [m], angle [rad], velocity [m/s] and spin
+            [rad/s].
+    """
     noise = jax.random.normal(key, state.array.shape, state.pose.dtype)
     scale = scale[jnp.array(CHANNEL_GROUP)].astype(noise.dtype)
     return state_from_array(state.array + scale[None] * noise)
 
 
 @eqx.filter_jit
-def _position_error(
+def position_error(
     key: Key,
     model: AbstractModel,
     belief: Belief,
@@ -180,7 +189,16 @@ def _position_error(
     wrench: Float[Array, "body 3"],
     next_state: State,
 ) -> FloatScalar:
-    """How far off the foretold positions are, on average over hypotheses [m]."""
+    """How far off the foretold positions are, on average over hypotheses [m].
+
+    Args:
+        key: for models that are random in themselves.
+        model: whose hypotheses are asked.
+        belief: these, and their weights.
+        state: before the step.
+        wrench: held over it [N, N, N m].
+        next_state: after it.
+    """
     foretold = jax.vmap(lambda each: model.transition(key, each, state, wrench))(
         belief.hypotheses
     )

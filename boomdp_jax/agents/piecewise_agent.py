@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from boomdp_jax.agents.agent import Agent
+from boomdp_jax.agents.agent import Agent, ExploreFn
 from boomdp_jax.envs.living_room import LivingRoom, piece_cost
 from boomdp_jax.models.per_body import PerBody
 from boomdp_jax.planning.belief import Belief
@@ -29,6 +29,7 @@ def make_piecewise_agent(
     goal: Float[Array, "body 3"],
     *,
     exploration: float = 0.0,
+    explore: ExploreFn | None = None,
 ) -> Agent:
     """An agent for rooms full of pieces, by a task's own hints.
 
@@ -38,6 +39,7 @@ def make_piecewise_agent(
         model: one for each piece.
         goal: pose that each body is to come to.
         exploration: probability that a decision is any action.
+        explore: what may be done instead of the planned action.
 
     Returns:
         The agent.
@@ -53,7 +55,10 @@ def make_piecewise_agent(
     def transition(key, hypothesis, state, wrench):
         law, physics, body, room, place = hypothesis
         law = eqx.combine(law, law_structure)
-        moved = law.transition(key, physics, state, wrench)
+        if model.sees_others:
+            moved = law.transition_among(key, physics, state, wrench, room)
+        else:
+            moved = law.transition(key, physics, state, wrench)
         del place
         # A piece that rolls through its place has not come to stay.
         return task.stopped(body, room, state, moved), jnp.zeros((), bool)
@@ -148,4 +153,5 @@ def make_piecewise_agent(
         num_hypotheses=num_hypotheses,
         num_held=hints.action_repeat,
         exploration=float(exploration),
+        explore=explore,
     )

@@ -18,8 +18,47 @@ LIKELIHOODS = ("auto", "filtered", "one-step", "open-loop")
 TASKS = ("pendulum", "cart", "acrobot", "living-room")
 """Tasks of `run`."""
 
-AGENTS = ("true", "physics", "lr", "lwr", "gp", "ensemble", "random")
+AGENTS = (
+    "true",
+    "physics",
+    "physics-map",
+    "physics-informative",
+    "physics-pretrained",
+    "physics-residual",
+    "point-fit",
+    "cma-es",
+    "lr",
+    "lr-body",
+    "lwr",
+    "lwr-world",
+    "lwr-pretrained",
+    "oo-lwr",
+    "gp",
+    "ensemble",
+    "physics-kinds",
+    "papers",
+    "random",
+)
 """Agents of `run`."""
+
+WORLDS = ("as-told", "dry", "off-centre", "caster", "large", "box")
+"""Worlds of the cart."""
+
+
+FIGURES = (
+    "1a",
+    "1b",
+    "2a",
+    "2b",
+    "cart",
+    "cart-noisy-1",
+    "cart-noisy-4",
+    "cart-noisy-16",
+    "cart-noisy-64",
+    "apartment",
+    "acrobot",
+)
+"""Figures of `figure`."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -69,6 +108,7 @@ def _make_parser() -> argparse.ArgumentParser:
     _add_simulate(commands.add_parser("simulate", help="from wrenches to a recording"))
     _add_run(commands.add_parser("run", help="an agent learns a task, over seeds"))
     _add_plot(commands.add_parser("plot", help="from runs to curves and a table"))
+    _add_figure(commands.add_parser("figure", help="figures of the papers, run anew"))
     _add_view(commands.add_parser("view", help="from a recording to a moving picture"))
     return parser
 
@@ -150,6 +190,7 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("task", choices=TASKS)
     add("--agent", choices=AGENTS, required=True)
+    add("--world", choices=WORLDS, help="of the cart: what is not as agents are told")
     add("--seeds", type=_whole(1), default=20, metavar="N", help="episodes: 0 to N - 1")
     add("--steps", type=_whole(1), metavar="T", help="of each; default: the task's")
     add(
@@ -176,12 +217,29 @@ def _add_plot(parser: argparse.ArgumentParser) -> None:
     add("--json", action="store_true", help="one JSON object a run, a line each")
 
 
+def _add_figure(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("names", nargs="+", choices=FIGURES, metavar="NAME", help=", ".join(FIGURES))
+    add(
+        "--out",
+        required=True,
+        metavar="DIR",
+        help="NAME.png, and runs; the same command goes on where the folder stands",
+    )
+    add("--seeds", type=_whole(1), default=20, metavar="N", help="of each agent")
+    add("--steps", type=_whole(1), metavar="T", help="default: the figure's")
+    add("--agents", nargs="+", metavar="NAME", help="others than the figure's own")
+    add("--shard", type=_shard, metavar="I/N", help="do seeds I, I + N... only")
+    add("--json", action="store_true", help="one JSON object an agent, a line each")
+
+
 def _add_view(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add(
         "data",
         metavar="DATA.npz|DIR",
-        help="planar-transitions-1, or a folder with scene.json and such files",
+        help="planar-transitions-1, a folder with scene.json and such files, or what"
+        " run wrote",
     )
     add("--scene", metavar="SCENE.json", help="outlines; required of a data file")
     add(

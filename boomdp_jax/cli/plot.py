@@ -2,7 +2,10 @@
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
 
 from boomdp_jax.cli.output import check_figure, print_json
 from boomdp_jax.experiments.scores import (
@@ -26,11 +29,28 @@ def run(arguments: argparse.Namespace) -> None:
     Raises:
         ValueError: a folder that is no run, holds no episode, or is of another task.
     """
-    from boomdp_jax.viz.learning_curves import plot_curves
-
     folders = [Path(folder) for folder in arguments.runs]
     path = Path(arguments.out or folders[0] / "curves.png")
     check_figure(str(path))
+    report(folders, path, as_json=arguments.json)
+
+
+def report(
+    folders: Sequence[Path], path: Path, *, as_json: bool, title: str | None = None
+) -> None:
+    """Draw runs, and print their table or JSON lines.
+
+    Args:
+        folders: of runs of one setting.
+        path: of the figure.
+        as_json: one JSON object a run instead of a table.
+        title: of the figure; default: the setting.
+
+    Raises:
+        ValueError: a folder that is no run, holds no episode, or is of another task.
+    """
+    from boomdp_jax.viz.learning_curves import plot_curves
+
     runs = [load_run(folder) for folder in folders]
     check_comparable(runs)
     names = [_name(loaded) for loaded in runs]
@@ -43,11 +63,11 @@ def run(arguments: argparse.Namespace) -> None:
             name: mean_band(loaded.model_error)
             for name, loaded in zip(names, runs, strict=True)
         },
-        title=runs[0].setting,
+        title=title or runs[0].setting,
     )
     figure.savefig(path, dpi=150)
     found = scores(runs)
-    if arguments.json:
+    if as_json:
         for score in found:
             print_json({"task": runs[0].setting, **score._asdict()})
     else:
@@ -77,7 +97,7 @@ def _table(first: LoadedRun, found: list[Score]) -> list[str]:
         lines.append(
             f"{score.agent:<32} {score.num_seeds:>5} {score.total:>9.1f} "
             f"{score.total_error:>7.1f} {regret:>7} {_steps(score.marks)} "
-            f"{1e3 * score.decision:>5.0f} ms {1e3 * score.learning:>5.0f} ms"
+            f"{_milliseconds(score.decision)} {_milliseconds(score.learning)}"
         )
     for published in PUBLISHED.get(first.setting, ()):
         lines.append(
@@ -89,3 +109,8 @@ def _table(first: LoadedRun, found: list[Score]) -> list[str]:
 
 def _steps(marks: tuple[int | None, ...]) -> str:
     return " ".join(f"{'-' if step is None else step:>7}" for step in marks)
+
+
+def _milliseconds(seconds: float) -> str:
+    """Eight characters; an episode that is one program has no time of its own parts."""
+    return f"{'-':>8}" if np.isnan(seconds) else f"{1e3 * seconds:>5.0f} ms"

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 
 from boomdp_jax.agents.episode import EpisodeRecord
-from boomdp_jax.experiments.run import begin_run
+from boomdp_jax.experiments.run import Run, begin_run
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -25,8 +25,32 @@ def run(arguments: argparse.Namespace) -> None:
         num_seeds=arguments.seeds,
         num_steps=arguments.steps,
         noise=arguments.noise,
+        world=arguments.world,
     )
-    seeds = begun.missing(arguments.shard or (0, 1))
+    results = fill(begun, arguments.shard)
+    if results is None:
+        missing = begun.missing()
+        print(f"{len(missing)} seeds are missing, of other shards", file=sys.stderr)
+        return
+    total = results["reward"].sum(axis=1)
+    error = total.std(ddof=1) / np.sqrt(len(total)) if len(total) > 1 else np.nan
+    print(
+        f"{begun.task}, {begun.agent}: return {total.mean():.1f} +- {error:.1f} "
+        f"(standard error, {len(total)} seeds); {begun.folder / 'results.npz'}"
+    )
+
+
+def fill(begun: Run, shard: tuple[int, int] | None) -> dict[str, np.ndarray] | None:
+    """Run the episodes of a shard that are missing, and say how it goes.
+
+    Args:
+        begun: the run.
+        shard: as of `Run.missing`; default: all.
+
+    Returns:
+        As of `Run.collect`.
+    """
+    seeds = begun.missing(shard or (0, 1))
     num_done = begun.num_seeds - len(begun.missing())
     if num_done:
         print(f"{num_done} of {begun.num_seeds} were there", file=sys.stderr)
@@ -44,14 +68,4 @@ def run(arguments: argparse.Namespace) -> None:
         )
 
     begun.run_seeds(seeds, report)
-    results = begun.collect()
-    if results is None:
-        missing = begun.missing()
-        print(f"{len(missing)} seeds are missing, of other shards", file=sys.stderr)
-        return
-    total = results["reward"].sum(axis=1)
-    error = total.std(ddof=1) / np.sqrt(len(total)) if len(total) > 1 else np.nan
-    print(
-        f"{begun.task}, {begun.agent}: return {total.mean():.1f} +- {error:.1f} "
-        f"(standard error, {len(total)} seeds); {begun.folder / 'results.npz'}"
-    )
+    return begun.collect()

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from boomdp_jax.cli.output import check_writable, numbered, print_notes
 from boomdp_jax.core.history_file import load_transitions
 from boomdp_jax.core.transition_table import TransitionTable
+from boomdp_jax.experiments.replay import replay
 from boomdp_jax.physics.scene_file import load_scene
 from boomdp_jax.physics.scene_spec import SceneSpec
 from boomdp_jax.physics.state import State
@@ -29,6 +30,9 @@ def run(arguments: argparse.Namespace) -> None:
         ValueError: bad input; nothing has been written then.
     """
     check_animation(arguments.out)
+    if (Path(arguments.data) / "run.json").is_file():
+        _view_run(arguments)
+        return
     scene_path, data_paths = find_files(arguments.data, arguments.scene)
     spec = load_scene(scene_path)
     print_notes(spec.notes)
@@ -46,6 +50,26 @@ def run(arguments: argparse.Namespace) -> None:
             fps=arguments.fps,
             title=Path(path).stem,
         )
+
+
+def _view_run(arguments: argparse.Namespace) -> None:
+    """Show an episode of a run, among all that can be seen."""
+    if arguments.scene is not None:
+        raise ValueError(
+            f"{arguments.data}: --scene: expected none for a run, which has its own, "
+            f"got {arguments.scene}"
+        )
+    shown = replay(arguments.data, arguments.episode)
+    animate(
+        shown.spec,
+        shown.states,
+        arguments.out,
+        dt=shown.dt,
+        params=shown.params,
+        fps=arguments.fps,
+        title=shown.title,
+        has_trail=True,
+    )
 
 
 def check_animation(path: str) -> None:

@@ -7,6 +7,8 @@ from boomdp_jax.envs.action_set import join_actions as join_actions
 from boomdp_jax.envs.blocking import Boxes as Boxes
 from boomdp_jax.envs.blocking import stopped_by_boxes as stopped_by_boxes
 from boomdp_jax.envs.cart import Cart as Cart
+from boomdp_jax.envs.cart_worlds import CART_WORLDS as CART_WORLDS
+from boomdp_jax.envs.cart_worlds import CartWorld as CartWorld
 from boomdp_jax.envs.environment import AbstractEnvironment as AbstractEnvironment
 from boomdp_jax.envs.environment import EnvParams as EnvParams
 from boomdp_jax.envs.environment import EnvState as EnvState
@@ -16,13 +18,16 @@ from boomdp_jax.envs.pendulum import Pendulum as Pendulum
 from boomdp_jax.envs.walls import Walls as Walls
 from boomdp_jax.envs.walls import stopped_at_walls as stopped_at_walls
 from boomdp_jax.envs.walls import walls_between as walls_between
+from boomdp_jax.envs.ways import way_to as way_to
 
 __all__ = [
+    "CART_WORLDS",
     "AbstractEnvironment",
     "Acrobot",
     "ActionSet",
     "Boxes",
     "Cart",
+    "CartWorld",
     "EnvParams",
     "EnvState",
     "LivingRoom",
@@ -34,4 +39,5 @@ __all__ = [
     "stopped_at_walls",
     "stopped_by_boxes",
     "walls_between",
+    "way_to",
 ]

@@ -5,8 +5,12 @@ the room, the cart and its way measured from their pictures, a pixel being a cen
 the straight way is 3.5 m, the way round the wall about twice that. Both fixed wheels at
 the handle act as one contact, which rolls along the cart and hardly slips across it.
 Forces push the centre of mass; walls stop the cart (`walls`). The episode is solved,
-and costs nothing any more, within `GOAL_RADIUS` of the goal.
+and costs nothing any more, within `GOAL_RADIUS` of the goal. In other worlds than the
+papers' the truth differs from what agents are told (`cart_worlds`).
 """
+
+import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, Key
 from boomdp_jax.envs.action_set import forces_round_circle
+from boomdp_jax.envs.cart_worlds import CartWorld, Corners, cart_world_of
 from boomdp_jax.envs.environment import (
     AbstractEnvironment,
     EnvParams,
@@ -30,11 +35,12 @@ from boomdp_jax.envs.walls import (
     walls_between,
 )
 from boomdp_jax.physics.params import Params
+from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
 from boomdp_jax.physics.state import State
-from boomdp_jax.physics.step import step
+from boomdp_jax.physics.step import rollout, step
 
-CART_OUTLINE = ((-0.65, -0.385), (0.66, -0.29), (0.66, 0.29), (-0.65, 0.385))
+CART_OUTLINE: Corners = ((-0.65, -0.385), (0.66, -0.29), (0.66, 0.29), (-0.65, 0.385))
 """Corners [m]: the handle's end is the wider one."""
 ROOM = (
     (-1.0, -1.0, 0.06, 5.8),
@@ -50,8 +56,8 @@ ROOM = (
 """Walls: least x and y, greatest x and y [m]."""
 START, GOAL, GOAL_RADIUS = (1.75, 1.34, 0.4), (5.28, 1.38), 0.3
 DENSITY, FORCE = 10.0, 30.0
-AXLE, VISCOUS = -0.5, (30.0, 600.0)
-"""Place of the wheels along the cart [m]; force per speed, rolling and across."""
+AXLE = -0.5
+"""Place of the wheels along the cart [m]."""
 VISCOUS_PRIOR = {
     "wheel.lateral_limit": {"center": 100.0},
     "wheel.dry_ratio": {"center": 0.0},
@@ -68,11 +74,21 @@ _AT_REST = 0.1
 """No push leaves a free cart slower than this, in m/s and rad/s together."""
 
 
-def cart_scene(*, is_known: bool) -> SceneSpec:
-    """The cart's scene; unknown: its density, and pins and wheels that it may have."""
-    wheel = {"type": "wheel", "a": "cart", "pose": [AXLE, 0.0, 0.0]}
+def cart_scene(*, is_known: bool, world: CartWorld | None = None) -> SceneSpec:
+    """The cart's scene: the true one, or what an agent is told.
+
+    Args:
+        is_known: whether it is the true one; else density, and pins and wheels that
+            the cart may have, are unknown.
+        world: what differs between the two; default: nothing.
+
+    Returns:
+        The scene; a centre of mass elsewhere is not in it (`Cart.default_params`).
+    """
+    world = world or CartWorld()
     unknown = {"unknown": {"revolute": 1, "wheel": 1}, "prior": VISCOUS_PRIOR}
-    known = {"constraints": [{**wheel, "viscous": list(VISCOUS)}]}
+    known = {"constraints": [_wheel(world), *map(dict, world.more)]}
+    outline = CART_OUTLINE if is_known else world.told(CART_OUTLINE)
     return scene_spec_from_dict(
         {
             "schema": "planar-scene-1",
@@ -84,7 +100,7 @@ def cart_scene(*, is_known: bool) -> SceneSpec:
                     "pose": list(START),
                     "shape": {
                         "type": "polygon",
-                        "vertices": np.array(CART_OUTLINE).tolist(),
+                        "vertices": np.array(outline).tolist(),
                     },
                     "density": DENSITY if is_known else None,
                 }
@@ -95,13 +111,60 @@ def cart_scene(*, is_known: bool) -> SceneSpec:
     )
 
 
+def _wheel(world: CartWorld) -> dict[str, Any]:
+    """Both of the cart's fixed wheels as one constraint."""
+    return {"type": "wheel", "a": "cart", "pose": [AXLE, 0.0, 0.0], **world.wheel}
+
+
+def _walled_scene() -> SceneSpec:
+    """The cart on its wheels and, as static boxes, the walls: for pictures."""
+    walls = walls_between(np.array(ROOM))
+    boxes = [
+        {
+            "name": f"wall {index}",
+            "static": True,
+            "pose": [*middle, 0.0],
+            "shape": {"type": "box", "half_extents": half},
+        }
+        for index, (middle, half) in enumerate(
+            zip(walls.middle.tolist(), walls.half_extents.tolist(), strict=True)
+        )
+    ]
+    cart = {
+        "name": "cart",
+        "pose": list(START),
+        "shape": {"type": "polygon", "vertices": np.array(CART_OUTLINE).tolist()},
+        "density": DENSITY,
+    }
+    return scene_spec_from_dict(
+        {
+            "schema": "planar-scene-1",
+            "gravity": [0.0, 0.0],
+            "dt": _TIME_STEP,
+            "bodies": [cart, *boxes],
+            "constraints": [_wheel(CartWorld())],
+        },
+        "cart among walls",
+    )
+
+
 class Cart(AbstractEnvironment):
     """Push a cart round a wall; `start_spread`: of its pose."""
 
-    def __init__(self, *, num_steps: int = _NUM_STEPS):
-        """Pose the task for so many steps an episode."""
+    def __init__(self, *, num_steps: int = _NUM_STEPS, world: str = "as-told"):
+        """Pose the task.
+
+        Args:
+            num_steps: of an episode.
+            world: what is true, one of `CART_WORLDS`.
+
+        Raises:
+            ValueError: no such world.
+        """
         self.name = "cart"
-        self.spec = cart_scene(is_known=False)
+        self._world = cart_world_of(world)
+        self.spec = cart_scene(is_known=False, world=self._world)
+        self._truth = cart_scene(is_known=True, world=self._world)
         self.actions = forces_round_circle(1, 0, FORCE, 8, with_nothing=False)
         self.num_steps = num_steps
         self.hints = PlanningHints(
@@ -113,12 +176,32 @@ class Cart(AbstractEnvironment):
         )
         self.walls = walls_between(np.array(ROOM))
         # The engine's outline: about the centre of mass.
-        self.outline = outline_of(np.asarray(self.spec.scene.vertices[0], float))
+        self.outline, self.true_outline = (
+            outline_of(np.asarray(spec.scene.vertices[0], float))
+            for spec in (self.spec, self._truth)
+        )
+
+    @property
+    def seen_spec(self) -> SceneSpec:
+        """The cart among its walls."""
+        return _walled_scene()
+
+    @property
+    def surroundings(self) -> tuple[Scene, Float[Array, "other 3"]]:
+        """The cart among its walls, and where these are."""
+        with jax.ensure_compile_time_eval():
+            middle = self.walls.middle
+            pose = jnp.concatenate([middle, jnp.zeros_like(middle[:, :1])], axis=1)
+            return self.seen_spec.scene, pose
 
     def default_params(self) -> EnvParams:
         """Starts within a quarter of a metre and in any direction."""
+        physics = self._truth.params()
+        if self._world.center_of_mass is not None:
+            center = jnp.array([self._world.center_of_mass], float)
+            physics = dataclasses.replace(physics, center_of_mass=center)
         return EnvParams(
-            physics=cart_scene(is_known=True).params(),
+            physics=physics,
             goal=jnp.array([[*GOAL, 0.0]], float),
             start=jnp.array([START], float),
             start_spread=jnp.array([[0.2, 0.2, jnp.pi]], float),
@@ -131,17 +214,32 @@ class Cart(AbstractEnvironment):
         turned = pose.at[:2].set(middle[:2])
         parts = jnp.linspace(1.0, 0.0, 6, dtype=pose.dtype)
         poses = turned[None] + parts[:, None] * (pose - turned)[None]
-        is_clear = jax.vmap(lambda p: wall_separation(self.walls, self.outline, p) > 0)(
-            poses
-        )
+        is_clear = jax.vmap(
+            lambda p: wall_separation(self.walls, self.true_outline, p) > 0
+        )(poses)
         return State(poses[jnp.argmax(is_clear)][None], jnp.zeros((1, 3), pose.dtype))
 
     def advance(
         self, physics: Params, state: State, wrench: Float[Array, "body 3"]
     ) -> State:
         """One step of the engine, or as far as walls let the cart go."""
-        moved, _ = step(self.scene, physics, state, wrench)
-        return stopped_at_walls(self.walls, self.outline, state, moved)
+        return self.halted(state, step(self.scene, physics, state, wrench)[0])
+
+    def halted(self, state: State, next_state: State) -> State:
+        """As far as walls let the cart go, by the outline that is told."""
+        return stopped_at_walls(self.walls, self.outline, state, next_state)
+
+    def happens(
+        self, physics: Params, state: State, wrench: Float[Array, "body 3"]
+    ) -> State:
+        """The same with the true outline."""
+        with jax.ensure_compile_time_eval():
+            scene = self._truth.scene
+        num = self._world.num_parts
+        wrenches = jnp.broadcast_to(wrench[None], (num, *wrench.shape))
+        states, _ = rollout(scene, physics, state, wrenches, dt=scene.dt / num)
+        moved = jax.tree.map(lambda leaf: leaf[-1], states)
+        return stopped_at_walls(self.walls, self.true_outline, state, moved)
 
     def reward(
         self,

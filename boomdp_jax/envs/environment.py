@@ -122,11 +122,46 @@ class AbstractEnvironment(abc.ABC):
         What is learnt of a body's own numbers should rest on such steps alone.
         """
 
+    def happens(
+        self, physics: Params, state: State, wrench: Float[Array, "body 3"]
+    ) -> State:
+        """One step of the world itself.
+
+        That of `advance`, unless agents are told something that is not true.
+        """
+        return self.advance(physics, state, wrench)
+
+    def halted(self, state: State, next_state: State) -> State:
+        """Where a step ends that might run into something, as agents know it.
+
+        Args:
+            state: before.
+            next_state: after, as if nothing were in the way.
+
+        Returns:
+            The next state; the very same unless a task has things that stop bodies.
+        """
+        del state
+        return next_state
+
     @property
     def scene(self) -> Scene:
         """Arrays of `spec`, concrete even while something is traced."""
         with jax.ensure_compile_time_eval():
             return self.spec.scene
+
+    @property
+    def seen_spec(self) -> SceneSpec:
+        """The scene of `surroundings`, for pictures."""
+        return self.spec
+
+    @property
+    def surroundings(self) -> tuple[Scene, Float[Array, "other 3"]]:
+        """All that can be seen, and poses of what states do not tell of, such as walls.
+
+        The scene's first bodies are those of `scene`.
+        """
+        return self.scene, jnp.zeros((0, 3))
 
     @property
     def num_actions(self) -> int:
@@ -179,8 +214,29 @@ class AbstractEnvironment(abc.ABC):
             is: `terminal` (goal reached) or `truncated` (its time is up).
         """
         del key
-        wrench = self.actions[action].astype(state.physics.pose.dtype)
-        moved = self.advance(params.physics, state.physics, wrench)
+        return self.push(state, self.actions[action], params)
+
+    def push(
+        self, state: EnvState, wrench: Float[Array, "body 3"], params: EnvParams
+    ) -> tuple[
+        Float[Array, " number"],
+        EnvState,
+        FloatScalar,
+        BoolScalar,
+        dict[str, BoolScalar],
+    ]:
+        """What `step` does, with any wrench.
+
+        Args:
+            state: now.
+            wrench: held over the step, at centres of mass [N, N, N m].
+            params: the world.
+
+        Returns:
+            As `step` does.
+        """
+        wrench = wrench.astype(state.physics.pose.dtype)
+        moved = self.happens(params.physics, state.physics, wrench)
         reward = self.reward(state.physics, wrench, moved, params.goal)
         is_over = state.is_terminal
         moved = jax.tree.map(

@@ -3,25 +3,24 @@
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
+import jax
+from jaxtyping import Array, Float
+
 from boomdp_jax.agents.agent import Agent, make_agent, random_agent
+from boomdp_jax.agents.curiosity import curious
 from boomdp_jax.envs.acrobot import Acrobot
 from boomdp_jax.envs.cart import Cart
 from boomdp_jax.envs.environment import AbstractEnvironment, EnvParams
 from boomdp_jax.envs.living_room import LivingRoom
 from boomdp_jax.envs.pendulum import Pendulum
+from boomdp_jax.experiments.papers_agent import papers_agent
+from boomdp_jax.experiments.recipes import RECIPES, Subject
 from boomdp_jax.experiments.room_agents import room_agent
-from boomdp_jax.inference.online import OnlineBelief
-from boomdp_jax.models.gaussian_process import GaussianProcess
-from boomdp_jax.models.linear import LinearRegression
-from boomdp_jax.models.locally_weighted import LocallyWeighted
-from boomdp_jax.models.model import AbstractModel
-from boomdp_jax.models.neural_ensemble import NeuralEnsemble
+from boomdp_jax.experiments.teaching import NUM_SAMPLES, taught, unbiased_samples
 from boomdp_jax.models.physics_model import PhysicsModel
-from boomdp_jax.models.regression import AbstractRegressor, BodyRegression
 from boomdp_jax.models.true_model import TrueModel
 
 MakeTask = Callable[..., AbstractEnvironment]
-MakeModel = Callable[[AbstractEnvironment, EnvParams], AbstractModel]
 
 TASKS: Mapping[str, MakeTask] = MappingProxyType(
     {
@@ -33,125 +32,134 @@ TASKS: Mapping[str, MakeTask] = MappingProxyType(
 )
 """Each takes `num_steps`."""
 
-_CAPACITY, _NUM_PARTICLES = 128, 512
-_NUM_HYPOTHESES = 4
-_EXPLORATION = 0.1
-"""Of agents that learn one law: without it, some push against one wall for ever."""
-
-
-def _true(task: AbstractEnvironment, params: EnvParams) -> AbstractModel:
-    return TrueModel(params.physics, task.advance)
-
-
-def _physics(task: AbstractEnvironment, params: EnvParams) -> AbstractModel:
-    online = OnlineBelief(task.spec, capacity=_CAPACITY, num_particles=_NUM_PARTICLES)
-    return PhysicsModel(online, task.advance, task.moved_freely)
-
-
-def _regression(make: Callable[[], AbstractRegressor], frame: str) -> MakeModel:
-    def build(task: AbstractEnvironment, params: EnvParams) -> AbstractModel:
-        # The papers' pendulum is seen without its angle: x, y and their rates.
-        is_bob = task.name == "pendulum"
-        return BodyRegression(
-            task.spec.scene,
-            make(),
-            frame="world" if is_bob else frame,
-            angles=not is_bob,
-        )
-
-    return build
-
-
-_REGRESSIONS: dict[str, tuple[Callable[[], AbstractRegressor], str]] = {
-    "lr": (LinearRegression, "world"),
-    "lwr": (LocallyWeighted, "body"),
-    "gp": (GaussianProcess, "body"),
-    "ensemble": (NeuralEnsemble, "body"),
-}
-"""What is fitted, and the frame that bodies are seen in."""
-
-_MODELS: dict[str, tuple[MakeModel, int]] = {
-    "true": (_true, 1),
-    "physics": (_physics, _NUM_HYPOTHESES),
-    "lr": (_regression(*_REGRESSIONS["lr"]), 1),
-    "lwr": (_regression(*_REGRESSIONS["lwr"]), 1),
-    "gp": (_regression(*_REGRESSIONS["gp"]), 1),
-    "ensemble": (_regression(*_REGRESSIONS["ensemble"]), _NUM_HYPOTHESES),
-}
-"""Model, and hypotheses that a decision rests on."""
-
-AGENTS = (*_MODELS, "random")
+TASK_OF: Mapping[str, str] = MappingProxyType(
+    {"physics-kinds": "living-room", "papers": "cart"}
+)
+"""Agents that can do one task only: `physics-kinds` knows kinds of furniture, `papers`
+plans a path to an end for one body."""
+_NOT_IN_ROOM = ("physics-residual",)
+"""Agents that cannot do the living room, where models are piece by piece."""
+AGENTS = ("true", *RECIPES, *TASK_OF, "random")
 """Names of agents."""
 
+_CAPACITY, _NUM_PARTICLES = 128, 512
+_TEACHING = 2013
+"""Folded into a key for what is taught, so that it is no episode's."""
 
-def make_task(name: str, num_steps: int | None = None) -> AbstractEnvironment:
+
+def make_task(
+    name: str, num_steps: int | None = None, world: str | None = None
+) -> AbstractEnvironment:
     """A task by its name.
 
     Args:
         name: one of `TASKS`.
         num_steps: of an episode; default: the task's own.
+        world: what is true instead of what agents are told, of `CART_WORLDS`; only the
+            cart has any. Default: nothing.
 
     Returns:
         The task.
 
     Raises:
-        ValueError: no such task, or fewer steps than one.
+        ValueError: no such task or world, or fewer steps than one.
     """
     if name not in TASKS:
         raise ValueError(f"task: expected one of {', '.join(TASKS)}; got {name!r}")
-    if num_steps is None:
-        return TASKS[name]()
-    if num_steps < 1:
+    if num_steps is not None and num_steps < 1:
         raise ValueError(f"num_steps: expected at least 1, got {num_steps}")
-    return TASKS[name](num_steps=num_steps)
+    if world is not None and name != "cart":
+        raise ValueError(f"world: expected none for {name}, got {world!r}")
+    options = {"num_steps": num_steps, "world": world}
+    return TASKS[name](
+        **{key: value for key, value in options.items() if value is not None}
+    )
 
 
-def check_agent(name: str) -> None:
-    """Refuse a name that is no agent's.
+def check_agent(name: str, task: AbstractEnvironment) -> None:
+    """Refuse a name that is no agent's, or none of this task's.
 
     Raises:
-        ValueError: it is none of `AGENTS`.
+        ValueError: it is none of `AGENTS`, or of another task.
     """
     if name not in AGENTS:
         raise ValueError(f"agent: expected one of {', '.join(AGENTS)}; got {name!r}")
+    only = TASK_OF.get(name, task.name)
+    if task.name != only:
+        raise ValueError(
+            f"agent: expected one that can do {task.name}; {name} does {only} alone"
+        )
+    if isinstance(task, LivingRoom) and name in _NOT_IN_ROOM:
+        raise ValueError(
+            f"agent: expected one that can do {task.name}, piece by piece; got {name!r}"
+        )
 
 
-def agent_of(name: str, task: AbstractEnvironment, params: EnvParams) -> Agent:
+def agent_of(
+    name: str,
+    task: AbstractEnvironment,
+    params: EnvParams,
+    *,
+    reading_noise: Float[Array, "4"] | None = None,
+) -> Agent:
     """An agent by its name, for a task.
 
     Args:
         name: one of `AGENTS`.
         task: what it is to do.
         params: the world; only `true` is told its numbers, all are told the goal.
+        reading_noise: standard deviation of the readings that those learn from who are
+            taught beforehand, as of `run_episode`.
 
     Returns:
-        The agent, which knows nothing yet.
+        The agent, which knows nothing yet; those that are taught beforehand have been,
+        which takes up to minutes.
 
     Raises:
-        ValueError: no such agent.
+        ValueError: no such agent, or none for this task.
     """
-    check_agent(name)
+    check_agent(name, task)
+    teaching_key = jax.random.fold_in(jax.random.key(0), _TEACHING)
     if isinstance(task, LivingRoom):
-        num = 1 if name == "random" else _MODELS[name][1]
-        is_one_law = name in _REGRESSIONS and num == 1
-        return room_agent(
-            name,
-            task,
-            params,
-            regressor=_REGRESSIONS.get(name),
-            num_hypotheses=num,
-            exploration=_EXPLORATION if is_one_law else 0.0,
+        return room_agent(name, task, params, teaching_key, reading_noise)
+    if name in ("true", "random"):
+        known = TrueModel(params.physics, task.happens)
+        if name == "random":
+            return random_agent(known, task.hints.action_repeat)
+        return make_agent(name, task, known, params.goal, num_hypotheses=1)
+    if isinstance(task, Cart) and name == "papers":
+        return papers_agent(task, params)
+    recipe = RECIPES[name]
+    model = recipe.build(subject_of(task))
+    if recipe.is_taught:
+        sample_key, key = jax.random.split(teaching_key)
+        samples = unbiased_samples(
+            sample_key, task, params, reading_noise=reading_noise
         )
-    if name == "random":
-        return random_agent(_true(task, params), task.hints.action_repeat)
-    build, num_hypotheses = _MODELS[name]
-    model = build(task, params)
-    is_one_law = name != "true" and num_hypotheses == 1
+        model = taught(key, model, samples)
     return make_agent(
         name,
         task,
         model,
         params.goal,
-        num_hypotheses=num_hypotheses,
-        exploration=_EXPLORATION if is_one_law else 0.0,
+        num_hypotheses=recipe.num_hypotheses,
+        exploration=recipe.exploration,
+        explore=curious(task, model)
+        if recipe.is_curious and isinstance(model, PhysicsModel)
+        else None,
+    )
+
+
+def subject_of(task: AbstractEnvironment) -> Subject:
+    """All of a task's bodies at once, for a recipe."""
+    return Subject(
+        spec=task.spec,
+        advance=task.advance,
+        moved_freely=task.moved_freely,
+        halted=task.halted,
+        is_bob=task.name == "pendulum",
+        surroundings=task.surroundings,
+        capacity=_CAPACITY,
+        num_particles=_NUM_PARTICLES,
+        num_samples=NUM_SAMPLES,
     )

@@ -7,23 +7,33 @@ same folder goes on where it stands; rewards, actions and states come out to the
 bits however often it was stopped and however many machines shared it.
 """
 
+import functools
 import os
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float, PyTree
 
+from boomdp_jax.agents.agent import Agent
+from boomdp_jax.agents.compiled_episode import can_compile, compile_episode
 from boomdp_jax.agents.episode import EpisodeRecord, run_episode
-from boomdp_jax.core.arrays import on_device
+from boomdp_jax.core.arrays import Key, on_device
 from boomdp_jax.core.json_file import check_same, read_json, write_json
 from boomdp_jax.core.npz_file import read_npz, write_npz
+from boomdp_jax.envs.environment import AbstractEnvironment, EnvParams
 from boomdp_jax.experiments.registry import agent_of, check_agent, make_task
 from boomdp_jax.inference.posterior import library_versions
 
 SCHEMA = "boomdp-run-1"
 """Version of the folder's format."""
+
+MAKING = "making_seconds"
+"""Beside an episode's record: the time it took to make the agent, all that it was
+taught beforehand included; the same for all episodes of one process."""
 
 
 class Run(NamedTuple):
@@ -36,6 +46,8 @@ class Run(NamedTuple):
     num_steps: int
     noise: tuple[float, float, float, float] | None
     """Standard deviation of the readings that are learnt from."""
+    world: str | None = None
+    """What is true instead of what agents are told; None: nothing."""
 
     def path(self, seed: int) -> Path:
         """File of one episode."""
@@ -67,15 +79,21 @@ class Run(NamedTuple):
             seeds: which.
             report: called with seed and record of each.
         """
-        task = make_task(self.task, self.num_steps)
+        task = make_task(self.task, self.num_steps, self.world)
         params = task.default_params()
-        agent = agent_of(self.agent, task, params)
         noise = None if self.noise is None else on_device(self.noise)
-        for seed in seeds:
-            record, _ = run_episode(
-                jax.random.key(seed), task, params, agent, reading_noise=noise
+        begin = time.perf_counter()
+        agent = agent_of(self.agent, task, params, reading_noise=noise)
+        made = {MAKING: np.asarray(time.perf_counter() - begin)}
+        if can_compile(agent) and seeds:
+            episode = compile_episode(task, params, agent, reading_noise=noise)
+        else:
+            episode = functools.partial(
+                _looped, task=task, params=params, agent=agent, noise=noise
             )
-            write_npz(self.path(seed), record._asdict())
+        for seed in seeds:
+            record, _ = episode(jax.random.key(seed))
+            write_npz(self.path(seed), record._asdict() | made)
             if report is not None:
                 report(seed, record)
 
@@ -84,17 +102,29 @@ class Run(NamedTuple):
 
         Returns:
             What `results.npz` then holds: the fields of `EpisodeRecord` with a leading
-            axis `seed`; None while episodes are missing.
+            axis `seed`, and `making_seconds`; None while episodes are missing.
         """
         if self.missing():
             return None
         records = [read_npz(self.path(seed)) for seed in range(self.num_seeds)]
         results = {
             field: np.stack([record[field] for record in records])
-            for field in EpisodeRecord._fields
+            for field in (*EpisodeRecord._fields, MAKING)
         }
         write_npz(self.folder / "results.npz", results)
         return results
+
+
+def _looped(
+    key: Key,
+    *,
+    task: AbstractEnvironment,
+    params: EnvParams,
+    agent: Agent,
+    noise: Float[Array, "4"] | None,
+) -> tuple[EpisodeRecord, PyTree]:
+    """An episode step by step, of a model that learns on the host."""
+    return run_episode(key, task, params, agent, reading_noise=noise)
 
 
 def begin_run(
@@ -105,6 +135,7 @@ def begin_run(
     num_seeds: int,
     num_steps: int | None = None,
     noise: Sequence[float] | None = None,
+    world: str | None = None,
 ) -> Run:
     """Begin a run in a folder, or take up one that was begun there.
 
@@ -116,6 +147,8 @@ def begin_run(
         num_steps: of each; default: the task's own.
         noise: standard deviation of the readings that agents learn from: position [m],
             angle [rad], velocity [m/s], spin [rad/s]; none: exact.
+        world: of the cart, what is true instead of what agents are told; default: the
+            task as it is.
 
     Returns:
         The run.
@@ -127,8 +160,8 @@ def begin_run(
     """
     if num_seeds < 1:
         raise ValueError(f"num_seeds: expected at least 1, got {num_seeds}")
-    made = make_task(task, num_steps)
-    check_agent(agent)
+    made = make_task(task, num_steps, world)
+    check_agent(agent, made)
     scale = None
     if noise is not None:
         scale = tuple(float(number) for number in noise)
@@ -137,7 +170,7 @@ def begin_run(
                 "noise: expected four finite numbers of at least 0 (position, angle, "
                 f"velocity, spin), got {list(noise)}"
             )
-    run = Run(Path(folder), task, agent, num_seeds, made.num_steps, scale)
+    run = Run(Path(folder), task, agent, num_seeds, made.num_steps, scale, world)
     run.folder.mkdir(parents=True, exist_ok=True)
     content = {
         "schema": SCHEMA,
@@ -148,6 +181,8 @@ def begin_run(
         "noise": None if scale is None else list(scale),
         "versions": library_versions(),
     }
+    if world is not None:
+        content["world"] = world
     path = run.folder / "run.json"
     if path.exists():
         check_same(path, read_json(path, SCHEMA), content)

@@ -75,12 +75,15 @@ class LoadedRun(NamedTuple):
     decision: float
     """Median time of a decision [s]."""
     learning: float
-    """Mean time of learning from a step [s]."""
+    """Mean time of learning from a step [s]; NaN where `decision` counts it in."""
+    world: str | None = None
+    """What was true instead of what agents are told."""
 
     @property
     def setting(self) -> str:
-        """The task, and whether readings were noisy."""
-        return f"{self.task}, noisy" if self.is_noisy else self.task
+        """The task, its world, and whether readings were noisy."""
+        parts = [self.task, *([self.world] if self.world else [])]
+        return ", ".join([*parts, "noisy"] if self.is_noisy else parts)
 
 
 class Score(NamedTuple):
@@ -131,6 +134,7 @@ def load_run(folder: str | os.PathLike) -> LoadedRun:
         model_error=np.stack([record["model_error"] for record in records]),
         decision=float(np.median(planning[planning > 0])),
         learning=float(np.mean(learning)),
+        world=content.get("world"),
     )
 
 

@@ -24,9 +24,11 @@ from boomdp_jax.inference.numpyro_model import make_model as make_model
 from boomdp_jax.inference.nuts import run_nuts as run_nuts
 from boomdp_jax.inference.online import Observed as Observed
 from boomdp_jax.inference.online import OnlineBelief as OnlineBelief
-from boomdp_jax.inference.online import RefitInfo as RefitInfo
+from boomdp_jax.inference.online_refit import RefitInfo as RefitInfo
 from boomdp_jax.inference.online_refresh import OnlineInfo as OnlineInfo
 from boomdp_jax.inference.online_state import BeliefState as BeliefState
+from boomdp_jax.inference.plain_metropolis import plain_metropolis as plain_metropolis
+from boomdp_jax.inference.plain_problem import plain_problem as plain_problem
 from boomdp_jax.inference.posterior import Posterior as Posterior
 from boomdp_jax.inference.posterior import load_posterior as load_posterior
 from boomdp_jax.inference.predict import predict as predict
@@ -65,6 +67,8 @@ __all__ = [
     "load_kinds",
     "load_posterior",
     "make_model",
+    "plain_metropolis",
+    "plain_problem",
     "predict",
     "run_nuts",
     "structure_kernel",

@@ -137,21 +137,27 @@ def with_gains(
 
     Args:
         targets: with a `FilteredLikelihood`, stacked along a leading object axis.
-        best: one fit of every structure of every object, in order.
+        best: one fit of every structure of every object; a structure without one keeps
+            the gains that it has.
         noise: of each of them.
 
     Returns:
         Targets whose likelihood tracks with the new gains.
     """
-    shape = targets.structures.shape[:2]
+    likelihood: Any = targets.log_likelihood
     found = filter_points(targets, best.index, best.structure, best.z, noise)
     dtype = targets.log_prior.dtype
 
-    def arrange(leaf):
-        return on_device(np.asarray(leaf).reshape(*shape, *leaf.shape[1:]), dtype)
+    def arrange(new, old):
+        whole = np.array(old, float)
+        whole[best.index, best.structure] = new
+        return on_device(whole, dtype)
 
     return eqx.tree_at(
         lambda t: (t.log_likelihood.gains, t.log_likelihood.reference),
         targets,
-        (jax.tree.map(arrange, found.gains), arrange(noise.reading)),
+        (
+            jax.tree.map(arrange, found.gains, likelihood.gains),
+            arrange(noise.reading, likelihood.reference),
+        ),
     )

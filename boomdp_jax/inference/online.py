@@ -28,9 +28,14 @@ from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.compile_ahead import signature
 from boomdp_jax.inference.components import independent_blocks
 from boomdp_jax.inference.infer import check_history
-from boomdp_jax.inference.online_posterior import online_params, online_posterior
+from boomdp_jax.inference.online_posterior import (
+    best_params,
+    online_params,
+    online_posterior,
+    structure_share,
+)
 from boomdp_jax.inference.online_refit import (
-    BlockRefit,
+    RefitInfo,
     RefitSettings,
     make_online_block,
     prior_belief,
@@ -51,18 +56,6 @@ _FIRST_REFIT, _GROWN = 8, 0.5
 # the last, and after this share of the table has been renewed.
 _REST, _RENEWED = 4, 0.25
 _MULTIPLE = 16
-
-
-class RefitInfo(NamedTuple):
-    """What a refit found, on the host."""
-
-    blocks: tuple[BlockRefit, ...]
-    seconds: float
-
-    @property
-    def has_changed(self) -> bool:
-        """Whether some block's world was found to have changed."""
-        return any(block.changed_at is not None for block in self.blocks)
 
 
 class Observed(NamedTuple):
@@ -153,10 +146,8 @@ class OnlineBelief:
             forgetting=float(forgetting),
             change_rate=float(change_rate),
         )
-        empty = np.zeros((0, spec.num_bodies, 6))
-        history = make_history(
-            empty, empty[..., :3], empty, self._dt, capacity=capacity
-        )
+        none = np.zeros((0, spec.num_bodies, 6))
+        history = make_history(none, none[..., :3], none, self._dt, capacity=capacity)
         self._empty = eqx.tree_at(
             lambda h: h.dt, history, on_device(np.full(capacity, self._dt))
         )
@@ -353,6 +344,14 @@ class OnlineBelief:
         if num_samples < 1:
             raise ValueError(f"num_samples: expected at least 1, got {num_samples}")
         return online_params(key, self.spec, self._parts(belief), num_samples)
+
+    def best_params(self, belief: BeliefState) -> Params:
+        """The most probable structure's most probable numbers; on the host."""
+        return best_params(self.spec, self._parts(belief))
+
+    def structure_share(self, belief: BeliefState) -> float:
+        """Probability of the most probable structure, the least over blocks."""
+        return structure_share(self._parts(belief))
 
     def _parts(self, belief: BeliefState) -> list[tuple[Block, BlockBelief]]:
         """Blocks, and what is believed of each."""

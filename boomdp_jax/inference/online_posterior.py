@@ -90,6 +90,53 @@ def online_params(
     return with_contact_numbers(rng, spec, blocks, decoded, params)
 
 
+def best_params(spec: SceneSpec, parts: list[tuple[Block, BlockBelief]]) -> Params:
+    """The most probable hypothesis: of the likeliest structure, the highest density.
+
+    Densities of structures with other numbers of coordinates do not compare, so that
+    the structure is chosen by what its particles weigh together.
+
+    Args:
+        spec: the scene.
+        parts: its blocks, and what is believed of each.
+
+    Returns:
+        Φ, without a leading axis.
+    """
+    blocks, decoded = [], []
+    for block, belief in parts:
+        target, particles = belief.target, belief.particles
+        likelihood: Any = target.log_likelihood
+        value = log_likelihoods(
+            target, belief.tally, particles.structure, particles.square
+        )
+        prior = jax.vmap(target.log_prior_density)(particles.structure, particles.z)
+        density = np.asarray(value + prior, float)
+        weight = np.exp(np.asarray(particles.log_weight, float))
+        structure = np.asarray(particles.structure)
+        likeliest = int(np.argmax(np.bincount(structure, weight)))
+        is_candidate = (structure == likeliest) & (weight > 0)
+        row = int(np.argmax(np.where(is_candidate, density, -np.inf)))
+        active = np.asarray(target.structures)[[likeliest]]
+        z = np.asarray(particles.z)[[row]]
+        blocks.append(block._replace(target=target))
+        decoded.append(decode(likelihood.coordinates, z, active, 1))
+    params, _ = merge_params(spec, blocks, decoded)
+    rng = np.random.default_rng(0)  # One draw is in one order.
+    whole = with_contact_numbers(rng, spec, blocks, decoded, params)
+    return jax.tree.map(lambda leaf: leaf[0], whole)
+
+
+def structure_share(parts: list[tuple[Block, BlockBelief]]) -> float:
+    """What the particles of the likeliest structure weigh, the least over blocks."""
+    shares = []
+    for _, belief in parts:
+        weight = np.exp(np.asarray(belief.particles.log_weight, float))
+        by_structure = np.bincount(np.asarray(belief.particles.structure), weight)
+        shares.append(by_structure.max() / weight.sum())
+    return float(min(shares))
+
+
 def _result(
     rng: np.random.Generator,
     spec: SceneSpec,

@@ -67,6 +67,18 @@ class BlockRefit(NamedTuple):
     """Of the target that tempering reached; 1 unless it took too many steps."""
 
 
+class RefitInfo(NamedTuple):
+    """What a refit found, on the host."""
+
+    blocks: tuple[BlockRefit, ...]
+    seconds: float
+
+    @property
+    def has_changed(self) -> bool:
+        """Whether some block's world was found to have changed."""
+        return any(block.changed_at is not None for block in self.blocks)
+
+
 class _Account(NamedTuple):
     """A fit of some of the rows."""
 

@@ -71,7 +71,9 @@ def with_typical_gains(
         vector[number * num_structures : (number + 1) * num_structures] = best[number]
     vector[top.index[chosen] * num_structures + top.structure[chosen]] = typical
     noise = NoiseFit.of_vector(vector)
-    targets = with_gains(targets, top, noise)
+    # In a world of another law some structure may have no fit that is finite.
+    mine = top.index * num_structures + top.structure
+    targets = with_gains(targets, top, noise.take(mine))
     again = make_fits(targets, fits.index, fits.structure, fits.z)
     fits = climb(targets, again, settings.num_repeats)
     return Found(targets, collect_modes(targets, fits, settings.num_modes), noise)

@@ -1,6 +1,15 @@
 """Bridges to other software; each loads it at first use."""
 
 from boomdp_jax.interop.arviz import to_arviz as to_arviz
+from boomdp_jax.interop.brax_env import BraxTask as BraxTask
+from boomdp_jax.interop.brax_env import register_brax_envs as register_brax_envs
+from boomdp_jax.interop.brax_posterior import task_randomisation as task_randomisation
+from boomdp_jax.interop.brax_training import TrainedPolicy as TrainedPolicy
+from boomdp_jax.interop.brax_training import train_ppo as train_ppo
+from boomdp_jax.interop.continuous_actions import ContinuousActions as ContinuousActions
+from boomdp_jax.interop.continuous_actions import (
+    continuous_actions as continuous_actions,
+)
 from boomdp_jax.interop.mjcf import RecordingLaws as RecordingLaws
 from boomdp_jax.interop.mjcf_export import save_mjcf as save_mjcf
 from boomdp_jax.interop.mjcf_export import to_mjcf as to_mjcf
@@ -22,8 +31,12 @@ from boomdp_jax.interop.recording import with_reading_noise as with_reading_nois
 __all__ = [
     "FAMILIES",
     "READING_NOISE",
+    "BraxTask",
+    "ContinuousActions",
     "RecordingLaws",
+    "TrainedPolicy",
     "brax_randomisation",
+    "continuous_actions",
     "from_mjcf",
     "hide",
     "random_object",
@@ -31,9 +44,12 @@ __all__ = [
     "randomise_mjx",
     "record",
     "record_random_pushes",
+    "register_brax_envs",
     "save_mjcf",
     "sweep_with_ray",
+    "task_randomisation",
     "to_arviz",
     "to_mjcf",
+    "train_ppo",
     "with_reading_noise",
 ]

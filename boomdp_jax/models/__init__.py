@@ -1,11 +1,17 @@
 """Transition models that an agent can learn: physics, regressions, point fits."""
 
 from boomdp_jax.models.features import BodyFeatures as BodyFeatures
+from boomdp_jax.models.fixed_belief import FixedBelief as FixedBelief
 from boomdp_jax.models.gaussian_process import GaussianProcess as GaussianProcess
+from boomdp_jax.models.known_kinds import KnownKinds as KnownKinds
 from boomdp_jax.models.linear import LinearRegression as LinearRegression
 from boomdp_jax.models.locally_weighted import LocallyWeighted as LocallyWeighted
+from boomdp_jax.models.metropolis_model import MetropolisModel as MetropolisModel
 from boomdp_jax.models.model import AbstractModel as AbstractModel
 from boomdp_jax.models.neural_ensemble import NeuralEnsemble as NeuralEnsemble
+from boomdp_jax.models.object_among_others import (
+    ObjectAmongOthers as ObjectAmongOthers,
+)
 from boomdp_jax.models.object_oriented import ObjectOriented as ObjectOriented
 from boomdp_jax.models.outline_contact import touched_sectors as touched_sectors
 from boomdp_jax.models.per_body import PerBody as PerBody
@@ -16,6 +22,7 @@ from boomdp_jax.models.point_fit import GaussNewton as GaussNewton
 from boomdp_jax.models.point_fit import PointFit as PointFit
 from boomdp_jax.models.regression import AbstractRegressor as AbstractRegressor
 from boomdp_jax.models.regression import BodyRegression as BodyRegression
+from boomdp_jax.models.residual_model import ResidualPhysics as ResidualPhysics
 from boomdp_jax.models.true_model import TrueModel as TrueModel
 
 __all__ = [
@@ -24,15 +31,20 @@ __all__ = [
     "BodyFeatures",
     "BodyRegression",
     "CmaEs",
+    "FixedBelief",
     "GaussNewton",
     "GaussianProcess",
+    "KnownKinds",
     "LinearRegression",
     "LocallyWeighted",
+    "MetropolisModel",
     "NeuralEnsemble",
+    "ObjectAmongOthers",
     "ObjectOriented",
     "PerBody",
     "PhysicsModel",
     "PointFit",
+    "ResidualPhysics",
     "ScenePhysics",
     "TrueModel",
     "touched_sectors",

@@ -31,6 +31,20 @@ from boomdp_jax.physics.state import State
 from boomdp_jax.planning.belief import Belief, certain
 
 
+def among(state: State, surroundings: Float[Array, "other 3"]) -> State:
+    """A state with bodies at rest behind its own.
+
+    Args:
+        state: of some bodies.
+        surroundings: poses of the others.
+    """
+    others = surroundings.astype(state.pose.dtype)
+    return State(
+        jnp.concatenate([state.pose, others]),
+        jnp.concatenate([state.twist, jnp.zeros_like(others)]),
+    )
+
+
 class ObjectOriented(AbstractModel):
     """One locally weighted regression per body and condition (OO-LWR).
 
@@ -41,6 +55,8 @@ class ObjectOriented(AbstractModel):
     features: BodyFeatures
     regressor: LocallyWeighted
     scene: Scene
+    surroundings: Float[Array, "other 3"]
+    """Poses of the scene's last bodies, which states do not have [m, m, rad]."""
     radius: Float[Array, ""]
     """How near something has to be to touch [m]."""
     num_sectors: int = eqx.field(static=True)
@@ -53,6 +69,7 @@ class ObjectOriented(AbstractModel):
         regressor: LocallyWeighted | None = None,
         *,
         radius: float,
+        surroundings: Float[Array, "other 3"] | None = None,
         num_sectors: int = 4,
         num_rays: int = 10,
         frame: str = "body",
@@ -64,6 +81,8 @@ class ObjectOriented(AbstractModel):
             scene: outlines, static ones included.
             regressor: settings; default: those of `LocallyWeighted`.
             radius: how near to its outline something has to be to touch a body [m].
+            surroundings: poses of the scene's last bodies, such as walls, if states
+                do not have them; these are to be static.
             num_sectors: sides of each body.
             num_rays: rays through each side.
             frame: `body` or `world`, see `BodyFeatures`.
@@ -81,6 +100,9 @@ class ObjectOriented(AbstractModel):
         self.features = BodyFeatures(scene, frame=frame, angles=angles)
         self.regressor = LocallyWeighted() if regressor is None else regressor
         self.scene = scene
+        self.surroundings = jnp.asarray(
+            jnp.zeros((0, 3)) if surroundings is None else surroundings
+        )
         self.radius = jnp.asarray(float(radius))
         self.num_sectors = num_sectors
         self.num_rays = num_rays
@@ -94,6 +116,7 @@ class ObjectOriented(AbstractModel):
         Returns:
             The sum of $2^s$ over sectors s with something next to them.
         """
+        state = among(state, self.surroundings)
 
         def of(body: Array) -> Array:
             sectors = touched_sectors(

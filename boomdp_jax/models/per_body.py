@@ -67,6 +67,8 @@ class PerBody(AbstractModel):
     """Anything with `transition`, leading axis `body`."""
     num_hypotheses: int = eqx.field(static=True)
     moved_freely: MovedFreely | None = eqx.field(static=True)
+    sees_others: bool = eqx.field(static=True)
+    """Whether each model is of the whole room, and `laws` have `transition_among`."""
     is_compiled: ClassVar[bool] = False
 
     def __init__(
@@ -76,6 +78,7 @@ class PerBody(AbstractModel):
         *,
         num_hypotheses: int,
         moved_freely: MovedFreely | None = None,
+        sees_others: bool = False,
     ):
         """Set up.
 
@@ -85,6 +88,8 @@ class PerBody(AbstractModel):
             num_hypotheses: drawn from each model.
             moved_freely: which bodies touched nothing in a step; the others then learn
                 nothing. Default: all learn.
+            sees_others: whether each model is told of the whole room, such as
+                `ObjectAmongOthers`, or of its body alone.
 
         Raises:
             ValueError: no model, or fewer hypotheses than one.
@@ -98,6 +103,7 @@ class PerBody(AbstractModel):
         self.models, self.laws = tuple(models), laws
         self.num_hypotheses = num_hypotheses
         self.moved_freely = None if moved_freely is None else jax.jit(moved_freely)
+        self.sees_others = sees_others
 
     def init(self, key: Key) -> PerBodyLearnt:
         """Nothing of any body."""
@@ -136,9 +142,15 @@ class PerBody(AbstractModel):
             parts[body] = update(
                 model,
                 parts[body],
-                _only(state, body),
-                jnp.asarray(wrench)[body][None],
-                _only(next_state, body),
+                *(
+                    (state, jnp.asarray(wrench), next_state)
+                    if self.sees_others
+                    else (
+                        _only(state, body),
+                        jnp.asarray(wrench)[body][None],
+                        _only(next_state, body),
+                    )
+                ),
                 jnp.asarray(learnt.is_broken[body] or bool(starts_episode)),
             )
             broken[body] = False
@@ -165,9 +177,13 @@ class PerBody(AbstractModel):
         num = len(self.models)
         lone = State(state.pose[:num, None], state.twist[:num, None])
         keys = jax.random.split(key, num)
-        moved = jax.vmap(lambda law, *row: law.transition(*row))(
-            self.laws, keys, hypothesis, lone, wrench[:num, None]
-        )
+
+        def move(law: Any, *row: Any) -> State:
+            if self.sees_others:
+                return law.transition_among(*row, state.pose)
+            return law.transition(*row)
+
+        moved = jax.vmap(move)(self.laws, keys, hypothesis, lone, wrench[:num, None])
         return State(
             state.pose.at[:num].set(moved.pose[:, 0]),
             state.twist.at[:num].set(moved.twist[:, 0]),

@@ -19,7 +19,7 @@ from boomdp_jax.inference.online_state import BeliefState
 from boomdp_jax.models.model import AbstractModel
 from boomdp_jax.models.true_model import Advance
 from boomdp_jax.physics.state import State
-from boomdp_jax.planning.belief import Belief
+from boomdp_jax.planning.belief import Belief, certain
 
 MovedFreely = Callable[[State, State], Bool[Array, " body"]]
 """Whether bodies touched nothing in a step, as an observer can tell."""
@@ -45,6 +45,7 @@ class PhysicsModel(AbstractModel):
     online: OnlineBelief = eqx.field(static=True)
     advance: Advance = eqx.field(static=True)
     moved_freely: MovedFreely = eqx.field(static=True)
+    is_point: bool = eqx.field(static=True)
     is_compiled: ClassVar[bool] = False
 
     def __init__(
@@ -52,6 +53,8 @@ class PhysicsModel(AbstractModel):
         online: OnlineBelief,
         advance: Advance,
         moved_freely: MovedFreely | None = None,
+        *,
+        is_point: bool = False,
     ):
         """Set up.
 
@@ -59,10 +62,12 @@ class PhysicsModel(AbstractModel):
             online: the scene, and how its belief is kept.
             advance: a step of the world under a hypothesis.
             moved_freely: which bodies touched nothing in a step; default: all.
+            is_point: whether `sample` gives the most probable hypothesis alone.
         """
         self.online = online
         self.advance = advance
         self.moved_freely = jax.jit(moved_freely or _always_free)
+        self.is_point = is_point
 
     def init(self, key: Key) -> PhysicsLearnt:
         """The prior."""
@@ -93,7 +98,9 @@ class PhysicsModel(AbstractModel):
         return PhysicsLearnt(belief, num_rows, False)
 
     def sample(self, key: Key, learnt: PyTree, num_hypotheses: int) -> Belief:
-        """Draws of the posterior, of equal weight."""
+        """Draws of the posterior, of equal weight; or the most probable one."""
+        if self.is_point:
+            return certain(self.online.best_params(learnt.belief))
         params = self.online.sample_params(key, learnt.belief, num_hypotheses)
         return Belief(params, jnp.zeros(num_hypotheses))
 

@@ -26,8 +26,10 @@ from boomdp_jax.models.cma_es import cma_minimise
 from boomdp_jax.models.features import BodyFeatures
 from boomdp_jax.models.gauss_newton import gauss_newton, sum_of_squares
 from boomdp_jax.models.model import AbstractModel
+from boomdp_jax.models.per_body import MovedFreely
 from boomdp_jax.models.physics_numbers import PhysicsNumbers
 from boomdp_jax.models.table import LEAST_ROWS, RETUNE_GROWTH, check_at_least
+from boomdp_jax.models.true_model import Advance
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
@@ -162,6 +164,8 @@ class PointFit(AbstractModel):
     numbers: PhysicsNumbers
     searcher: AbstractSearch
     capacity: int = eqx.field(static=True)
+    advance: Advance | None = eqx.field(static=True)
+    moved_freely: MovedFreely | None = eqx.field(static=True)
     is_compiled: ClassVar[bool] = True
 
     def __init__(
@@ -169,6 +173,8 @@ class PointFit(AbstractModel):
         scene: Scene,
         searcher: AbstractSearch | None = None,
         *,
+        advance: Advance | None = None,
+        moved_freely: MovedFreely | None = None,
         capacity: int = 200,
         has_pin: bool = False,
         friction: float = 0.3,
@@ -179,6 +185,10 @@ class PointFit(AbstractModel):
         Args:
             scene: outlines and time step.
             searcher: how to search; default: `GaussNewton()`.
+            advance: a step of the world under a hypothesis, for those who plan; it may
+                know of walls. Default: the engine's step.
+            moved_freely: which bodies touched nothing in a step; rows of the others do
+                not count. Default: all count.
             capacity: newest rows that are kept.
             has_pin: whether each body may be pinned to the world besides.
             friction: of contact, where the scene has it; it is not learnt.
@@ -198,6 +208,7 @@ class PointFit(AbstractModel):
         )
         self.searcher = GaussNewton() if searcher is None else searcher
         self.capacity = capacity
+        self.advance, self.moved_freely = advance, moved_freely
 
     def init(self, key: Key) -> PointLearnt:
         """No rows, and the middle of what is likely."""
@@ -231,6 +242,8 @@ class PointFit(AbstractModel):
         del starts_episode  # Rows stand for themselves.
         read = jnp.concatenate([state.array, wrench, next_state.array], axis=-1)
         is_seen = jnp.all(jnp.isfinite(read), axis=-1)
+        if self.moved_freely is not None:
+            is_seen = is_seen & self.moved_freely(state, next_state)
         is_row = jnp.any(is_seen[np.array(self.features.moving)])
         place = learnt.num_seen % self.capacity
 
@@ -274,8 +287,10 @@ class PointFit(AbstractModel):
         state: State,
         wrench: Float[Array, "body 3"],
     ) -> State:
-        """A step of the engine."""
+        """A step of the engine, or of the world as `advance` has it."""
         del key
+        if self.advance is not None:
+            return self.advance(hypothesis, state, wrench)
         return step(self.numbers.scene, hypothesis, state, wrench)[0]
 
     def params(self, learnt: PointLearnt) -> Params:

@@ -1,6 +1,6 @@
-"""Curves of runs over steps, with bands."""
+"""Curves of runs over steps and of learners over samples, with bands."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,15 +25,30 @@ Band = tuple[
 
 _LEAST_ERROR = 1e-6
 """Of a prediction that is worth drawing [m]."""
+_LONG = 100
+"""Steps from which on their axis is logarithmic, so that the first ones are seen."""
 _BY_AGENT = {
     "true": EDGE,
     "physics": PREDICTION,
+    "physics-pretrained": SLIDE,
+    "physics-kinds": FLOOR,
+    "physics-map": FLOOR,
+    "physics-informative": SLIDE,
+    "physics-residual": ROD,
+    "papers": ROD,
+    "point-fit": FLOOR,
+    "cma-es": SLIDE,
     "lr": ROD,
+    "lr-body": STATIC,
     "lwr": BASELINE,
+    "lwr-world": BASELINE,
+    "lwr-pretrained": PIN,
+    "oo-lwr": PIN,
     "gp": FLOOR,
     "ensemble": PIN,
     "random": STATIC,
 }
+"""Agents that are shown together differ."""
 
 
 def draw_curves(
@@ -42,6 +57,7 @@ def draw_curves(
     *,
     ylabel: str,
     is_logarithmic: bool = False,
+    sizes: Sequence[int] | None = None,
 ) -> None:
     """Draw a curve with its band for each agent.
 
@@ -49,18 +65,21 @@ def draw_curves(
         ax: a `matplotlib.axes.Axes`.
         bands: by name, one value a step from step 1 on; NaN is left out.
         ylabel: what is drawn, with its unit.
-        is_logarithmic: whether the axis is.
+        is_logarithmic: whether its axis is.
+        sizes: numbers of samples that the values belong to, instead of steps.
     """
     for name, (middle, low, high) in bands.items():
         colour = _BY_AGENT.get(name.partition(" ")[0], SLIDE)
-        steps = np.arange(1, len(middle) + 1)
+        steps = np.arange(1, len(middle) + 1) if sizes is None else np.asarray(sizes)
         ax.fill_between(steps, low, high, color=colour, alpha=0.2, linewidth=0)
         ax.plot(steps, middle, color=colour, linewidth=1.6, label=name)
     if is_logarithmic:
         ax.set_yscale("log")
-    ax.set_xlabel("step")
+    if sizes is not None or any(len(band[0]) > _LONG for band in bands.values()):
+        ax.set_xscale("log")
+    ax.set_xlabel("step" if sizes is None else "samples")
     ax.set_ylabel(ylabel)
-    ax.set_xlim(left=1)
+    ax.set_xlim(left=1 if sizes is None else sizes[0])
     ax.grid(color=GRID, linewidth=0.8)
     ax.set_axisbelow(True)
     for side in ("top", "right"):
@@ -102,6 +121,41 @@ def plot_curves(
         ylabel="error of foretold positions, one step [m]",
         is_logarithmic=bool(positive),
     )
+    left.legend(frameon=False)
+    figure.suptitle(title)
+    return figure
+
+
+def plot_sample_curves(
+    position: Mapping[str, Band],
+    velocity: Mapping[str, Band],
+    sizes: Sequence[int],
+    *,
+    title: str,
+) -> Any:
+    """A figure of held-out errors by number of samples.
+
+    Args:
+        position: by learner, one value a size [m].
+        velocity: by learner [m/s].
+        sizes: numbers of samples.
+        title: of the figure.
+
+    Returns:
+        The `matplotlib.figure.Figure`.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+    """
+    from boomdp_jax.viz.snapshots import new_figure
+
+    figure = new_figure((10.0, 4.0))
+    left, right = figure.subplots(1, 2)
+    labels = "held-out error of position [m]", "held-out error of velocity [m/s]"
+    for ax, bands, label in zip(
+        (left, right), (position, velocity), labels, strict=True
+    ):
+        draw_curves(ax, bands, ylabel=label, is_logarithmic=True, sizes=sizes)
     left.legend(frameon=False)
     figure.suptitle(title)
     return figure

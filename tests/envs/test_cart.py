@@ -162,3 +162,16 @@ def test_starts_are_clear_of_walls():
 def test_a_wall_without_inside_is_refused():
     with pytest.raises(ValueError, match=r"walls\[1\]: expected greatest x and y"):
         walls_between(np.array([[0.0, 0.0, 1.0, 1.0], [0.0, 1.0, 1.0, 0.5]]))
+
+
+def test_what_is_seen_round_the_cart_are_its_walls():
+    task = Cart(num_steps=1)
+    scene, pose = task.surroundings
+    assert scene.num_bodies == 1 + len(ROOM) == 1 + len(pose)
+    np.testing.assert_array_equal(
+        np.asarray(scene.is_static), [False] + len(ROOM) * [True]
+    )
+    np.testing.assert_allclose(scene.vertices[0], task.scene.vertices[0], atol=1e-6)
+    corners = np.asarray(scene.vertices[1:, :4]) + np.asarray(pose)[:, None, :2]
+    boxes = np.concatenate([corners.min(axis=1), corners.max(axis=1)], axis=1)
+    np.testing.assert_allclose(boxes, ROOM, atol=1e-6)

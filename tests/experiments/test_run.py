@@ -7,7 +7,9 @@ import pytest
 from boomdp_jax.agents import run_episode
 from boomdp_jax.cli import main as cli
 from boomdp_jax.core.npz_file import read_npz
+from boomdp_jax.envs import CART_WORLDS
 from boomdp_jax.experiments import AGENTS, TASKS, agent_of, begin_run, make_task
+from boomdp_jax.experiments.scores import load_run
 
 STEPS = 6
 
@@ -79,6 +81,16 @@ def test_another_run_does_not_go_into_the_folder(whole):
             "task: expected one of pendulum, cart, acrobot, living-room; got",
         ),
         (("cart", "lucky"), {}, "agent: expected one of true, physics"),
+        (
+            ("cart", "physics-kinds"),
+            {},
+            "agent: expected one that can do cart; physics-kinds does living-room al",
+        ),
+        (
+            ("pendulum", "papers"),
+            {},
+            "agent: expected one that can do pendulum; papers does cart alone",
+        ),
         (("cart", "true"), {"num_seeds": 0}, "num_seeds: expected at least 1, got 0"),
         (("cart", "true"), {"num_steps": 0}, "num_steps: expected at least 1, got 0"),
         (
@@ -103,6 +115,25 @@ def test_what_cannot_be_is_refused(arguments, options, message, tmp_path):
 def test_the_command_line_knows_the_same_names():
     assert cli.TASKS == tuple(TASKS)
     assert cli.AGENTS == AGENTS
+    assert cli.WORLDS == tuple(CART_WORLDS)
+
+
+def test_a_run_in_another_world_says_so(tmp_path):
+    """In the box's world the outline is told wrong, and nothing else differs."""
+    settings = {"num_seeds": 1, "num_steps": 3}
+    run = begin_run("cart", "random", tmp_path, world="box", **settings)
+    run.run_seeds([0])
+    assert load_run(tmp_path).setting == "cart, box"
+    with pytest.raises(ValueError, match="world"):
+        begin_run("cart", "random", tmp_path, world="large", **settings)
+    with pytest.raises(ValueError, match="world: expected none for pendulum, got"):
+        begin(tmp_path / "other", world="box")
+
+
+def test_the_living_room_has_no_residual_physics():
+    task = make_task("living-room", 2)
+    with pytest.raises(ValueError, match="agent: expected one that can do living-room"):
+        agent_of("physics-residual", task, task.default_params())
 
 
 def test_the_command_line_runs_and_goes_on(tmp_path, capsys):
@@ -121,7 +152,7 @@ def test_the_command_line_runs_and_goes_on(tmp_path, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in AGENTS if name != "physics"])
+@pytest.mark.parametrize("name", ["true", "lr", "oo-lwr", "gp", "ensemble", "random"])
 def test_every_agent_acts_on_the_cart(name):
     task = make_task("cart", 8)
     params = task.default_params()

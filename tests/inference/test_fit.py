@@ -174,6 +174,20 @@ def test_gains_belong_to_their_structure(wheeled):
     assert not np.allclose(gains.last[0, 0], gains.last[0, 1])
     first = jax.tree.map(lambda leaf: leaf[0], tracked).log_likelihood
     assert int(first.structure_index(wheeled.structures[0, 1])) == 1
+    # A structure without a fit keeps what it has.
+    rest = np.flatnonzero((index != 1) | (structure != 1))
+    some = with_gains(wheeled, top.take(rest), noise.take(rest)).log_likelihood
+    had = wheeled.log_likelihood
+    for new, whole, old in zip(
+        *(
+            jax.tree.leaves((one.gains, one.reference))
+            for one in (some, tracked.log_likelihood, had)
+        ),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(new[1, 1], old[1, 1])
+        np.testing.assert_array_equal(new[0], whole[0])
+        np.testing.assert_array_equal(new[1, 0], whole[1, 0])
 
 
 def test_only_distinct_fits_are_kept():

@@ -6,7 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from boomdp_jax.models import BodyRegression, LocallyWeighted, ObjectOriented
+from boomdp_jax.models import (
+    BodyRegression,
+    LocallyWeighted,
+    ObjectAmongOthers,
+    ObjectOriented,
+)
+from boomdp_jax.models.features import BodyFeatures
 from boomdp_jax.physics import State
 
 from .worlds import cart, expected, learn
@@ -108,3 +114,31 @@ def test_a_batch_of_predictions_is_a_loop_of_them():
         state, wrench, _ = jax.tree.map(lambda leaf, t=t: leaf[t], rows)
         one = one_by_one(key, hypothesis, state, wrench)
         np.testing.assert_allclose(one.array, batch.array[t], atol=1e-9)
+
+
+def test_walls_that_states_do_not_have_are_felt_all_the_same():
+    scene, rows = cart(walls=True).scene, walled_rows(60)
+    wall = rows[0].pose[0, 1:]
+    whole, part = model_of(scene), model_of(scene, surroundings=wall)
+    own = jax.tree.map(lambda leaf: leaf[:, :1], rows)
+    same = jax.vmap(whole.conditions)(rows[0])
+    np.testing.assert_array_equal(jax.vmap(part.conditions)(own[0]), same)
+    assert len(np.unique(same)) > 1
+    told = expected(whole, learn(whole, rows), rows)
+    also = expected(part, learn(part, own), own)
+    np.testing.assert_allclose(also.pose, told.pose[:, :1], atol=1e-12)
+
+
+def test_one_body_among_others_learns_what_all_at_once_do():
+    scene, rows = cart(walls=True).scene, walled_rows(60)
+    whole = model_of(scene)
+    one = ObjectAmongOthers(
+        scene=scene,
+        body=jnp.asarray(0),
+        features=BodyFeatures(cart().scene),
+        regressor=whole.regressor,
+        radius=whole.radius,
+    )
+    told = expected(whole, learn(whole, rows), rows)
+    also = expected(one, learn(one, rows), rows)
+    np.testing.assert_allclose(also.array, told.array, atol=1e-12)

@@ -70,3 +70,21 @@ def test_fewer_than_one_sample_is_refused(task):
     belief = online.init(jax.random.key(0))
     with pytest.raises(ValueError, match="num_samples: expected at least 1, got 0"):
         online.sample_params(jax.random.key(0), belief, 0)
+
+
+def test_the_most_probable_hypothesis_is_of_the_likeliest_structure(task):
+    online = OnlineBelief(task.spec, capacity=16, num_particles=256)
+    model = PhysicsModel(online, task.advance, is_point=True)
+    learnt = model.init(jax.random.key(0))
+    belief = model.sample(jax.random.key(1), learnt, 4)
+    assert belief.num_hypotheses == 1
+    best = belief[0]
+    draws = online.sample_params(jax.random.key(2), learnt.belief, 1000)
+    kinds = np.stack([draws.revolute.active[:, 0], draws.wheel.active[:, 0, 0]], axis=1)
+    found, counts = np.unique(kinds, axis=0, return_counts=True)
+    likeliest = found[np.argmax(counts)]
+    of_best = [bool(best.revolute.active[0]), bool(best.wheel.active[0, 0])]
+    np.testing.assert_array_equal(of_best, likeliest)
+    share = online.structure_share(learnt.belief)
+    # Drawn systematically, each structure as often as it weighs.
+    assert share == pytest.approx(counts.max() / 1000, abs=2e-3)

@@ -4,9 +4,18 @@ import numpy as np
 import pytest
 
 from boomdp_jax.models import CmaEs, GaussNewton, PointFit
-from boomdp_jax.physics import rollout, scene_spec_from_dict
+from boomdp_jax.models.point_fit import AbstractSearch
+from boomdp_jax.physics import State, rollout, scene_spec_from_dict
 
 from .worlds import cart, error_share, expected, learn, only, part, ride
+
+
+class Stay(AbstractSearch):
+    """Finds nothing."""
+
+    def improve(self, key, residual_fn, best, is_due):
+        return best
+
 
 SMALL = GaussNewton(num_starts=3, num_steps=8)
 
@@ -117,3 +126,25 @@ def test_bad_settings_are_refused():
         GaussNewton(num_starts=0)
     with pytest.raises(ValueError, match="num_steps: expected at least 1, got 0"):
         GaussNewton(num_steps=0)
+
+
+def test_steps_that_touched_something_do_not_count():
+    rows = part(ride(120), 0, 12)
+    wall = float(np.median(rows[2].pose[:, 0, 0]))
+    model = PointFit(
+        cart().scene,
+        Stay(),
+        capacity=12,
+        moved_freely=lambda state, after: after.pose[:, 0] > wall,
+    )
+    assert int(learn(model, rows).num_seen) == 6
+
+
+def test_a_world_with_walls_is_planned_in():
+    def stopped(params, state, wrench):
+        return State(state.pose, 0.0 * state.twist)
+
+    model = PointFit(cart().scene, Stay(), advance=stopped)
+    rows = part(ride(120), 0, 3)
+    told = expected(model, model.init(jax.random.key(0)), rows)
+    np.testing.assert_array_equal(told.pose, rows[0].pose)

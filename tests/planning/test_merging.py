@@ -1,5 +1,7 @@
 """Merging against `numpy.unique`, and what each policy keeps."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -88,16 +90,9 @@ def test_stratified_takes_turns():
 def test_random_keeps_all_alike():
     kept = np.zeros(300)
     cell, stratum, score, exists = (jnp.asarray(p) for p in random_children(5))
+    merged = jax.jit(functools.partial(merge, capacity=30, policy="random"))
     for number in range(300):
-        found = merge(
-            jax.random.key(number),
-            cell,
-            stratum,
-            score,
-            exists,
-            capacity=30,
-            policy="random",
-        )
+        found = merged(jax.random.key(number), cell, stratum, score, exists)
         kept[np.asarray(found.child)] += 1
     best = leaders(*(np.asarray(part) for part in (cell, score, exists)))
     assert kept.sum() == kept[best].sum()
