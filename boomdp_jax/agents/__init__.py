@@ -13,6 +13,7 @@ from boomdp_jax.agents.path_agent import make_path_agent as make_path_agent
 from boomdp_jax.agents.piecewise_agent import (
     make_piecewise_agent as make_piecewise_agent,
 )
+from boomdp_jax.agents.restlessness import restless as restless
 
 __all__ = [
     "Agent",
@@ -25,5 +26,6 @@ __all__ = [
     "make_path_agent",
     "make_piecewise_agent",
     "random_agent",
+    "restless",
     "run_episode",
 ]

@@ -61,6 +61,8 @@ class Recipe(NamedTuple):
     """Beforehand, and learns nothing while it acts (`teaching`)."""
     is_curious: bool = False
     """Begins with the pushes that tell most (`agents.curiosity`)."""
+    is_restless: bool = False
+    """Does anything rather than lean against a wall (`agents.restlessness`)."""
 
 
 def _physics(subject: Subject) -> AbstractModel:
@@ -140,11 +142,11 @@ def _one_law(build: Callable[[Subject], AbstractModel]) -> Recipe:
 
 RECIPES: Mapping[str, Recipe] = MappingProxyType(
     {
-        "physics": Recipe(_physics, _NUM_HYPOTHESES),
-        "physics-map": Recipe(_most_probable),
+        "physics": Recipe(_physics, _NUM_HYPOTHESES, is_restless=True),
+        "physics-map": Recipe(_most_probable, is_restless=True),
         "physics-informative": Recipe(_physics, _NUM_HYPOTHESES, is_curious=True),
         "physics-pretrained": Recipe(_taught_physics, _NUM_HYPOTHESES, is_taught=True),
-        "physics-residual": Recipe(_residual, _NUM_HYPOTHESES),
+        "physics-residual": Recipe(_residual, _NUM_HYPOTHESES, is_restless=True),
         "point-fit": _one_law(_point_fit(GaussNewton)),
         "cma-es": _one_law(_point_fit(CmaEs)),
         "lr": _one_law(_regression(lambda _: LinearRegression(), "world")),

@@ -6,18 +6,22 @@ from types import MappingProxyType
 import jax
 from jaxtyping import Array, Float
 
-from boomdp_jax.agents.agent import Agent, make_agent, random_agent
+from boomdp_jax.agents.agent import Agent, ExploreFn, make_agent, random_agent
 from boomdp_jax.agents.curiosity import curious
+from boomdp_jax.agents.restlessness import restless
 from boomdp_jax.envs.acrobot import Acrobot
 from boomdp_jax.envs.cart import Cart
 from boomdp_jax.envs.environment import AbstractEnvironment, EnvParams
 from boomdp_jax.envs.living_room import LivingRoom
 from boomdp_jax.envs.pendulum import Pendulum
 from boomdp_jax.experiments.papers_agent import papers_agent
-from boomdp_jax.experiments.recipes import RECIPES, Subject
+from boomdp_jax.experiments.recipes import RECIPES, Recipe, Subject
 from boomdp_jax.experiments.room_agents import room_agent
+from boomdp_jax.experiments.sensors import with_sensors
 from boomdp_jax.experiments.teaching import NUM_SAMPLES, taught, unbiased_samples
+from boomdp_jax.models.model import AbstractModel
 from boomdp_jax.models.physics_model import PhysicsModel
+from boomdp_jax.models.residual_model import ResidualPhysics
 from boomdp_jax.models.true_model import TrueModel
 
 MakeTask = Callable[..., AbstractEnvironment]
@@ -108,8 +112,9 @@ def agent_of(
         name: one of `AGENTS`.
         task: what it is to do.
         params: the world; only `true` is told its numbers, all are told the goal.
-        reading_noise: standard deviation of the readings that those learn from who are
-            taught beforehand, as of `run_episode`.
+        reading_noise: standard deviation of readings, as of `run_episode`: those who
+            learn the physics are told of it, those who are taught beforehand have it in
+            what they are taught.
 
     Returns:
         The agent, which knows nothing yet; those that are taught beforehand have been,
@@ -130,7 +135,7 @@ def agent_of(
     if isinstance(task, Cart) and name == "papers":
         return papers_agent(task, params)
     recipe = RECIPES[name]
-    model = recipe.build(subject_of(task))
+    model = recipe.build(subject_of(task, reading_noise))
     if recipe.is_taught:
         sample_key, key = jax.random.split(teaching_key)
         samples = unbiased_samples(
@@ -144,16 +149,34 @@ def agent_of(
         params.goal,
         num_hypotheses=recipe.num_hypotheses,
         exploration=recipe.exploration,
-        explore=curious(task, model)
-        if recipe.is_curious and isinstance(model, PhysicsModel)
-        else None,
+        explore=_explore(recipe, task, model),
     )
 
 
-def subject_of(task: AbstractEnvironment) -> Subject:
-    """All of a task's bodies at once, for a recipe."""
+def _explore(
+    recipe: Recipe, task: AbstractEnvironment, model: AbstractModel
+) -> ExploreFn | None:
+    """What is done for what it tells."""
+    if recipe.is_curious and isinstance(model, PhysicsModel):
+        return curious(task, model)
+    if not recipe.is_restless or not len(task.surroundings[1]):
+        return None
+    if isinstance(model, ResidualPhysics):
+        return restless(task, lambda learnt: learnt.physics)
+    return restless(task)
+
+
+def subject_of(
+    task: AbstractEnvironment, reading_noise: Float[Array, "4"] | None = None
+) -> Subject:
+    """All of a task's bodies at once, for a recipe.
+
+    Args:
+        task: what is to be done.
+        reading_noise: of the sensors, which agents are told (`sensors`).
+    """
     return Subject(
-        spec=task.spec,
+        spec=with_sensors(task.spec, reading_noise),
         advance=task.advance,
         moved_freely=task.moved_freely,
         halted=task.halted,

@@ -12,6 +12,7 @@ from boomdp_jax.envs.environment import EnvParams
 from boomdp_jax.envs.living_room import LivingRoom
 from boomdp_jax.experiments.known_furniture import furniture_kinds
 from boomdp_jax.experiments.recipes import RECIPES, TOUCH_RADIUS, Recipe, Subject
+from boomdp_jax.experiments.sensors import with_sensors
 from boomdp_jax.experiments.teaching import taught, unbiased_samples
 from boomdp_jax.models.features import BodyFeatures
 from boomdp_jax.models.locally_weighted import LocallyWeighted
@@ -43,7 +44,7 @@ def room_agent(
         task: the room.
         params: its world.
         teaching_key: of what is taught beforehand.
-        reading_noise: of what is taught beforehand.
+        reading_noise: as of `registry.agent_of`.
     """
     if name in ("true", "random"):
         known = _known(task, params)
@@ -65,7 +66,10 @@ def room_agent(
             name, task, _by_engine(task, models, RECIPES["physics"]), params.goal
         )
     recipe = RECIPES[name]
-    models = tuple(recipe.build(_subject(spec)) for spec in task.pieces)
+    models = tuple(
+        recipe.build(_subject(with_sensors(spec, reading_noise)))
+        for spec in task.pieces
+    )
     is_regression = isinstance(models[0], BodyRegression)
     laws = stacked(list(models)) if is_regression else None
     if recipe.is_taught:

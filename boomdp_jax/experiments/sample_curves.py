@@ -84,7 +84,7 @@ def _each_seed(
     sizes: tuple[int, ...],
     reading_noise: Float[Array, "4"] | None,
 ) -> Iterator[SampleErrors]:
-    subject = subject_of(task)._replace(num_samples=sizes[-1])
+    subject = subject_of(task, reading_noise)._replace(num_samples=sizes[-1])
     model = RECIPES[agent].build(subject)
     held_key, told_key = jax.random.split(jax.random.key(0))
     held_out = unbiased_samples(held_key, task, params, num_samples=NUM_HELD_OUT)
