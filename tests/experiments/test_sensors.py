@@ -14,7 +14,6 @@ from boomdp_jax.inference.prior import read_prior
 def test_the_prior_is_around_what_sensors_err_but_no_less_than_by_default():
     spec = Cart().spec
     told = with_sensors(spec, jnp.array([0.04, 1e-5, 0.02, 0.04]))
-    found = prior_scales(told).noise
     found = read_prior(told.prior, told.source).noise
     expected = {"position": 0.04, "angle": 1e-3, "velocity": 0.02, "spin": 0.04}
     assert found == pytest.approx(expected)
