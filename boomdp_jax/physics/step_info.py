@@ -27,6 +27,9 @@ class StepInfo(eqx.Module):
     cache: Any = None
     """Impulses of all contacts, which make the next step's start better if they are
     passed to it; `rollout` passes them on itself and does not return them."""
+    contact_wrench: Float[Array, "*batch body 3"] | None = None
+    """Mean over the step of what contacts did to each body, world frame, about its
+    centre of mass [N, N, N m]: what a body's skin feels; zero for static bodies."""
 
 
 def report(prepared: Prepared, motion: Motion) -> tuple[Array, Array]:

@@ -63,8 +63,9 @@ def world_step(
     out, impulses = in_lanes(
         _rollout_of, world, state, wrench[None], cache, static=sizes
     )
-    pose, twist, *reported = jax.tree.map(lambda leaf: leaf[0], out)
-    return State(pose, twist), StepInfo(*reported, cache=impulses)
+    pose, twist, *reported, push = jax.tree.map(lambda leaf: leaf[0], out)
+    info = StepInfo(*reported, cache=impulses, contact_wrench=push)
+    return State(pose, twist), info
 
 
 def empty_cache(scene: Scene) -> Float[Array, "round pair 4"] | None:
@@ -93,7 +94,8 @@ def world_rollout(
     """Advance a world by many steps, given what `rollout` is given."""
     _check(scene, params)
     out, _ = in_lanes(_rollout, scene, params, state, wrenches, length)
-    return State(*out[:2]), StepInfo(*out[2:])
+    pose, twist, *reported, push = out
+    return State(pose, twist), StepInfo(*reported, contact_wrench=push)
 
 
 def _check(scene: Scene, params: Params) -> None:
@@ -115,7 +117,7 @@ def _world(scene: Scene, params: Params, length: Any) -> World:
 def _rollout(
     scene: Scene, params: Params, state: State, wrenches: Any, length: Any
 ) -> tuple[tuple, Any]:
-    """Fields of the states and of the reports, and the impulses at the end."""
+    """Fields of states and reports, wrenches of contact, and impulses at the end."""
     sizes = (scene.num_substeps, scene.num_sweeps)
     if length.ndim == 1:
         world = _world(scene, params, length)
@@ -161,18 +163,20 @@ def _scanned(advance, start: tuple, inputs: Any) -> tuple[tuple, Any]:
 def _advance(sizes: tuple, world: World, carry: tuple, wrench: Any) -> tuple:
     """One step, and what it reports."""
     motion, impulses = carry
-    motion, impulses, overlap = _step(sizes, world, motion, _columns(wrench), impulses)
+    motion, impulses, overlap, push = _step(
+        sizes, world, motion, _columns(wrench), impulses
+    )
     error, is_finite = report(world.prepared, motion)
     pose, twist = jnp.stack(motion[:3], axis=1), jnp.stack(motion[3:], axis=1)
     overflow = None if overlap is None else jnp.zeros_like(is_finite)
-    out = (pose, twist, error, is_finite, overlap, overflow)
+    out = (pose, twist, error, is_finite, overlap, overflow, push)
     return (motion, impulses), out
 
 
 def _step(
     sizes: tuple, world: World, motion: Motion, force: tuple, impulses: Any
-) -> tuple[Motion, Impulses | None, Any]:
-    """All substeps of one step."""
+) -> tuple[Motion, Impulses | None, Any, Any]:
+    """All substeps of one step: also deepest overlap, and mean wrenches of contact."""
     num_substeps, num_sweeps = sizes
     prepared, contact = world
     mobile, length = prepared.mobile, prepared.length
@@ -186,7 +190,7 @@ def _step(
             return general_substep(prepared, motion, force), None
 
         motion, _ = _repeated(alone, motion, num_substeps)
-        return motion, None, None
+        return motion, None, None, None
     contacts, touch = find_contacts(contact, motion, impulses)
     light = mobile / prepared.mass
     ease = Ease(light, light, mobile / prepared.inertia)
@@ -206,7 +210,7 @@ def _step(
             carry = coupled_substep(
                 contacts, prepared, motion, moved, force, touch, num_sweeps
             )
-            return carry, None
+            return carry, carry[1].sums
         carry = contact_substep(
             contacts,
             contact.eases,
@@ -218,10 +222,13 @@ def _step(
             touch,
             num_sweeps,
         )
-        return carry, None
+        return carry, carry[1].sums
 
-    (motion, touch), _ = _repeated(advance, (motion, touch), num_substeps)
-    return motion, touch.impulses, contacts.overlap
+    (motion, touch), sums = _repeated(advance, (motion, touch), num_substeps)
+    # Each substep's impulses, over the length of the whole step.
+    whole = num_substeps * length[None]
+    push = jnp.stack([jnp.sum(part, axis=0) / whole for part in sums], axis=1)
+    return motion, touch.impulses, contacts.overlap, push
 
 
 def _repeated(advance, start: Any, num: int) -> tuple:

@@ -255,6 +255,20 @@ def test_step_by_step_with_the_cache_is_the_rollout():
     assert state.pose[2, 1] < states.pose[9, 2, 1] - 1e-5
 
 
+def test_contact_wrenches_bear_the_weight_of_what_stands():
+    lower = body("lower", (0.25, 0.25), (0.0, 0.25, 0.0))
+    upper = body("upper", (0.25, 0.25), (0.1, 0.75, 0.0))
+    spec = spec_of(FLOOR, lower, upper)
+    _, info, _ = run(spec, 120)
+    mass = np.asarray(spec.scene.area) * np.asarray(spec.params().density)
+    push = np.asarray(info.contact_wrench[-1])
+    # At rest every body is held up against its own weight, with no torque left over.
+    assert push[1:, 1] == pytest.approx(mass[1:] * G, rel=1e-3)
+    assert np.abs(push[1:, 2]).max() < 1e-3 * mass[1] * G
+    assert np.abs(push[1:, 0]).max() < 1e-3 * mass[1] * G
+    assert np.all(push[0] == 0)
+
+
 def test_params_without_a_surface_are_refused():
     spec = spec_of(FLOOR, body("box", (0.2, 0.2), (0.0, 0.2, 0.0)))
     params = spec.params()
