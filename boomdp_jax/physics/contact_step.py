@@ -36,7 +36,7 @@ from boomdp_jax.physics.contact_rows import (
 )
 from boomdp_jax.physics.contact_world import ContactWorld, Fixed
 from boomdp_jax.physics.motion import Motion
-from boomdp_jax.physics.tournament import Halves, moved_on, seated, unseated
+from boomdp_jax.physics.tournament import Halves, moved_on, play, seated, unseated
 from boomdp_jax.physics.trigonometry import heading_turn
 
 NUM_POINTS = 2
@@ -107,19 +107,19 @@ def find_contacts(
         corner_x=[cos * x - sin * y for x, y in corners],
         corner_y=[sin * x + cos * y for x, y in corners],
     )
-    halves, rows, kept, nearest = seated(pose, num_bodies), [], [], []
     zero = jnp.zeros_like(motion.x)
-    sums = seated((zero, zero, zero), num_bodies)
-    for fixed, eases, allowed, before in zip(
-        world.fixed, world.eases, world.allowed, impulses, strict=True
-    ):
-        *handed_on, (start, sums) = over_pairs(
-            _begin, halves, fixed, allowed, eases, before, sums, num_passed=1
-        )
-        rows.append(start.rows)
-        kept.append(start.impulses)
-        nearest.append(jnp.min(start.separation, axis=0))
-        halves, sums = moved_on(handed_on[0]), moved_on(sums)
+    carry = seated(pose, num_bodies), seated((zero, zero, zero), num_bodies)
+
+    def turn(carry, own):
+        halves, sums = carry
+        *handed_on, (start, sums) = over_pairs(_begin, halves, *own, sums, num_passed=1)
+        nearest = jnp.min(start.separation, axis=0)
+        carry = moved_on(handed_on[0]), moved_on(sums)
+        return carry, (start.rows, start.impulses, nearest)
+
+    own = zip(world.fixed, world.allowed, world.eases, impulses, strict=True)
+    (_, sums), found = play(turn, carry, list(own))
+    rows, kept, nearest = (list(part) for part in zip(*found, strict=True))
     overlap = jnp.maximum(-functools.reduce(jnp.minimum, nearest), 0.0)
     contacts = Contacts(rows, overlap, world.smoothing)
     return contacts, Touch(kept, unseated(sums, num_bodies))
@@ -184,16 +184,21 @@ def part_all(
     Returns:
         What was given, twists, impulses, and the speeds at which surfaces met.
     """
-    num_bodies, pace = twists[0].shape[0], given.pace
-    halves, known = seated(twists, num_bodies), seated(before, num_bodies)
-    rows, eases, after, meetings = [], [], [], []
-    for row, ease, old in zip(given.rows, given.eases, impulses, strict=True):
-        *handed_on, (halves, new, met) = over_pairs(
+    num_bodies = twists[0].shape[0]
+    carry = given.pace, seated(before, num_bodies), seated(twists, num_bodies)
+
+    def turn(carry, own):
+        pace, known, halves = carry
+        row, ease, old = own
+        row, ease, pace, known, (halves, new, met) = over_pairs(
             part, row, ease, pace, known, halves, old, num_passed=4
         )
-        row, ease, pace, known = handed_on
-        _append((rows, row), (eases, ease), (after, new), (meetings, met))
-        halves, known = moved_on(halves), moved_on(known)
+        carry = pace, moved_on(known), moved_on(halves)
+        return carry, (row, ease, new, met)
+
+    own = zip(given.rows, given.eases, impulses, strict=True)
+    (pace, _, halves), found = play(turn, carry, list(own))
+    rows, eases, after, meetings = (list(part) for part in zip(*found, strict=True))
     return Sweeping(rows, eases, pace), unseated(halves, num_bodies), after, meetings
 
 
@@ -211,22 +216,20 @@ def settle_all(
     Returns:
         Twists and impulses.
     """
-    num_bodies, pace, after = twists[0].shape[0], given.pace, []
-    halves = seated(twists, num_bodies)
-    for row, ease, met, old in zip(
-        given.rows, given.eases, meetings, impulses, strict=True
-    ):
+    num_bodies = twists[0].shape[0]
+
+    def turn(carry, own):
+        pace, halves = carry
+        row, ease, met, old = own
         pace, (halves, new) = over_pairs(
             settle, pace, row, ease, met, halves, old, num_passed=1
         )
-        after.append(new)
-        halves = moved_on(halves)
+        return (pace, moved_on(halves)), new
+
+    own = zip(given.rows, given.eases, meetings, impulses, strict=True)
+    carry = given.pace, seated(twists, num_bodies)
+    (_, halves), after = play(turn, carry, list(own))
     return unseated(halves, num_bodies), after
-
-
-def _append(*pairs: tuple[list, Any]) -> None:
-    for values, value in pairs:
-        values.append(value)
 
 
 def contact_substep(
