@@ -65,7 +65,7 @@ def follow_motion(
     state: State,
     motion: TimedMotion,
     *,
-    settle: float = 0.5,
+    settle: float = 1.0,
     grip: Grip = _GRIP,
 ) -> Followed:
     """Let the robot follow a motion, and stand still at its end.

@@ -12,7 +12,9 @@ limits is not taken: the grasp opens as it begins, and the step is taken without
 no step's mean reaction ever exceeds the limits.
 
 A robot that touches something else is pushed there as well, which the balance cannot
-tell from the reaction; `GraspReport.is_exact` is then false.
+tell from the reaction; `GraspReport.is_exact` is then false, and the limits are applied
+to the sum: a robot that bumps into a wall may drop what it holds, and one that braces
+itself against a wall may pull harder than it feels.
 """
 
 import dataclasses
@@ -33,7 +35,8 @@ from boomdp_jax.physics.state import State
 from boomdp_jax.physics.step import StepInfo, step
 
 GRASP_REACH = 0.04
-"""A body's outline no further than this from the gripper can be grasped [m]."""
+"""A body's outline no further than this from the gripper can be grasped [m]; fingers,
+which would bridge it, are no bodies of their own."""
 
 _TOUCHING = 1e-3
 """Bodies this near each other may push each other in a step [m]."""

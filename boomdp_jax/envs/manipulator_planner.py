@@ -126,6 +126,8 @@ class ManipulatorPlanner:
     ) -> ArmMotion | None:
         """Move, with an empty gripper, to one of some configurations.
 
+        What the gripper is at is left straight back first.
+
         Args:
             seed: of the planner.
             state: where all is, and the robot starts.
@@ -259,11 +261,18 @@ class ManipulatorPlanner:
     ) -> Float[np.ndarray, "corner 5"] | None:
         room = ArmClearance(self.world, np.asarray(state.pose))
         start = np.asarray(self.world.configuration(state))
-        margin = self._margin(room, start)
         limit = self.world.robot.joint_limit
-        return self.plan_motion(
+        first, margin = start[None], self._margin(room, start)
+        is_forearm = room.pairs[:, 0] == self.world.bodies[-1]
+        if np.any(margin[is_forearm] < self.margin):
+            # First away from what the gripper is at, straight back.
+            back = self._approach(start)[::-1]
+            if np.all(self._within(back) & room.is_free(back, margin)):
+                first = np.stack([start, back[-1]])
+                margin = self._margin(room, back[-1])
+        corners = self.plan_motion(
             seed,
-            start,
+            first[-1],
             goals,
             lambda found: room.is_free(found, margin),
             np.array([*self.lower, -np.pi, *-limit]),
@@ -272,6 +281,7 @@ class ManipulatorPlanner:
             resolution=self.resolution,
             is_periodic=_IS_ANGLE,
         )
+        return None if corners is None else np.concatenate([first[:-1], corners])
 
     def _margin(
         self, room: ArmClearance, start: np.ndarray

@@ -16,7 +16,6 @@ from boomdp_jax.envs import (
 from boomdp_jax.interop import plan_motion
 from boomdp_jax.physics import Params
 from boomdp_jax.physics.quantities import mass_and_inertia
-from boomdp_jax.planning import timed_motion
 from tests.envs.arm_rooms import BOX_POSE, FOLDED, ROBOT, room, straight
 
 WORLD = room()
@@ -77,21 +76,17 @@ def test_robot_drives_through_the_gap_and_pulls_the_box_where_it_should_go():
     off = np.asarray(pulled.state.pose[BOX]) - (BOX_POSE + PULL)
     assert np.abs(off[:2]).max() < 0.02
     assert abs(off[2]) < 0.03
+    # Let go, the robot leaves the box where it is, and comes home.
+    home = plan.move(0, pulled.state, FOLDED[None])
     let_go = open_grasp(pulled.params)
-    apart = follow_motion(
-        WORLD,
-        let_go,
-        pulled.state,
-        timed_motion(
-            np.stack([np.asarray(WORLD.configuration(pulled.state))] * 2),
-            ROBOT.levers,
-            speed=1.0,
-            acceleration=1.0,
-            dt=WORLD.spec.dt,
-        ),
-    )
-    assert not apart.grasp.is_held.any()
-    assert not apart.grasp.has_slipped.any()
+    left = follow_motion(WORLD, let_go, pulled.state, home.motion)
+    assert not left.grasp.is_held.any()
+    assert not left.grasp.has_slipped.any()
+    assert left.overlap.max() < 1e-3
+    moved = np.asarray(left.state.pose[BOX] - pulled.state.pose[BOX])
+    assert np.abs(moved).max() < 1e-3
+    error = np.asarray(WORLD.configuration(left.state)) - home.corners[-1]
+    assert np.abs((error + np.pi) % (2.0 * np.pi) - np.pi).max() < 0.01
 
 
 @pytest.mark.slow
@@ -152,12 +147,16 @@ def test_gripper_holds_only_what_is_near_and_can_move_and_closing_moves_nothing(
     state, _ = grasping()
     held = take_hold(WORLD, params(), state, BOX)
     weld = held.weld
+    # The same shapes and types: whatever is compiled for the one does for the other.
+    opened = open_grasp(held)
+    assert jax.tree.map(jax.typeof, held) == jax.tree.map(jax.typeof, opened)
     gripper = np.asarray(ROBOT.gripper(WORLD.configuration(state)))
     spin = np.exp(1j * BOX_POSE[2])
     at = complex(*BOX_POSE[:2]) + complex(*weld.anchor_b[-1]) * spin
     assert abs(at - complex(*gripper[:2])) < 1e-12
     assert abs(weld.angle[-1] - (gripper[2] - BOX_POSE[2])) < 1e-12
-    assert not open_grasp(held).weld.active[-1]
+    assert weld.active[-1]
+    assert not opened.weld.active[-1]
     for body in ("wall 0", "robot base"):
         with pytest.raises(ValueError, match="body: expected one that can move, with"):
             take_hold(WORLD, params(), state, WORLD.spec.index(body))

@@ -91,6 +91,7 @@ def test_way_through_a_wall_is_refused():
     assert plan.manipulate(0, START, BOX, BELOW, through) is None
 
 
+@pytest.mark.slow
 def test_planned_motions_are_free_when_looked_at_ten_times_as_closely():
     pytest.importorskip("ompl")
     plan = planner(plan_motion)
