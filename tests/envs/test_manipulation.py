@@ -90,6 +90,20 @@ def test_robot_drives_through_the_gap_and_pulls_the_box_where_it_should_go():
 
 
 @pytest.mark.slow
+def test_box_is_turned_and_taken_through_the_gap():
+    pytest.importorskip("ompl")
+    plan, state = planner(plan_motion), WORLD.state(FOLDED)
+    poses = np.array([[0.9, 0.0, 0.0], [-0.8, 0.0, 0.0]])
+    found = plan.manipulate(0, state, BOX, np.array([-0.2, 0.0]), poses)
+    reached = follow_motion(WORLD, params(), state, found.reach.motion)
+    held = take_hold(WORLD, reached.params, reached.state, BOX)
+    carried = follow_motion(WORLD, held, reached.state, found.carry.motion)
+    assert carried.grasp.is_held.all()
+    assert max(reached.overlap.max(), carried.overlap.max()) < 1e-3
+    assert np.abs(carried.state.pose[BOX] - poses[-1]).max() < 0.02
+
+
+@pytest.mark.slow
 def test_reaction_felt_is_what_gives_the_box_its_momentum():
     state, motion = grasping()
     truth = take_hold(WORLD, params(is_on_floor=False), state, BOX)
