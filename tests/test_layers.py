@@ -31,8 +31,9 @@ ALLOWED = {("cli", "experiments"), ("cli", "interop"), ("cli", "viz")}
 ALLOWED_WHEN_CALLED = {("inference", "viz"), ("inference", "interop")}
 OWNERS = {"brax": "interop", "mujoco": "interop", "arviz": "interop"}
 OWNERS |= {"matplotlib": "viz", "ray": "interop", "mctx": "planning"}
+OWNERS |= {"ompl": "interop"}
 # What `import boomdp_jax` must not load.
-HEAVY = ["brax", "mujoco", "arviz", "matplotlib", "numpyro", "ray", "mctx"]
+HEAVY = ["brax", "mujoco", "arviz", "matplotlib", "numpyro", "ray", "mctx", "ompl"]
 
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

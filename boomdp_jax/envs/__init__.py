@@ -4,6 +4,13 @@ from boomdp_jax.envs.acrobot import Acrobot as Acrobot
 from boomdp_jax.envs.action_set import ActionSet as ActionSet
 from boomdp_jax.envs.action_set import forces_round_circle as forces_round_circle
 from boomdp_jax.envs.action_set import join_actions as join_actions
+from boomdp_jax.envs.arm_clearance import ArmClearance as ArmClearance
+from boomdp_jax.envs.arm_clearance import Held as Held
+from boomdp_jax.envs.arm_control import Followed as Followed
+from boomdp_jax.envs.arm_control import follow_motion as follow_motion
+from boomdp_jax.envs.arm_control import take_hold as take_hold
+from boomdp_jax.envs.arm_scene import ArmScene as ArmScene
+from boomdp_jax.envs.arm_scene import arm_scene as arm_scene
 from boomdp_jax.envs.blocking import Boxes as Boxes
 from boomdp_jax.envs.blocking import stopped_by_boxes as stopped_by_boxes
 from boomdp_jax.envs.cart import Cart as Cart
@@ -13,7 +20,15 @@ from boomdp_jax.envs.environment import AbstractEnvironment as AbstractEnvironme
 from boomdp_jax.envs.environment import EnvParams as EnvParams
 from boomdp_jax.envs.environment import EnvState as EnvState
 from boomdp_jax.envs.environment import PlanningHints as PlanningHints
+from boomdp_jax.envs.grasp import GraspReport as GraspReport
+from boomdp_jax.envs.grasp import Grip as Grip
+from boomdp_jax.envs.grasp import grasping_step as grasping_step
+from boomdp_jax.envs.grasp import open_grasp as open_grasp
 from boomdp_jax.envs.living_room import LivingRoom as LivingRoom
+from boomdp_jax.envs.manipulator_planner import ArmMotion as ArmMotion
+from boomdp_jax.envs.manipulator_planner import Manipulation as Manipulation
+from boomdp_jax.envs.manipulator_planner import ManipulatorPlanner as ManipulatorPlanner
+from boomdp_jax.envs.mobile_arm import MobileArm as MobileArm
 from boomdp_jax.envs.pendulum import Pendulum as Pendulum
 from boomdp_jax.envs.walls import Walls as Walls
 from boomdp_jax.envs.walls import stopped_at_walls as stopped_at_walls
@@ -25,19 +40,34 @@ __all__ = [
     "AbstractEnvironment",
     "Acrobot",
     "ActionSet",
+    "ArmClearance",
+    "ArmMotion",
+    "ArmScene",
     "Boxes",
     "Cart",
     "CartWorld",
     "EnvParams",
     "EnvState",
+    "Followed",
+    "GraspReport",
+    "Grip",
+    "Held",
     "LivingRoom",
+    "Manipulation",
+    "ManipulatorPlanner",
+    "MobileArm",
     "Pendulum",
     "PlanningHints",
     "Walls",
+    "arm_scene",
+    "follow_motion",
     "forces_round_circle",
+    "grasping_step",
     "join_actions",
+    "open_grasp",
     "stopped_at_walls",
     "stopped_by_boxes",
+    "take_hold",
     "walls_between",
     "way_to",
 ]

@@ -23,6 +23,7 @@ from boomdp_jax.interop.object_families import random_pushes as random_pushes
 from boomdp_jax.interop.object_families import (
     record_random_pushes as record_random_pushes,
 )
+from boomdp_jax.interop.ompl_motion import plan_motion as plan_motion
 from boomdp_jax.interop.ray_sweep import sweep_with_ray as sweep_with_ray
 from boomdp_jax.interop.recording import READING_NOISE as READING_NOISE
 from boomdp_jax.interop.recording import record as record
@@ -39,6 +40,7 @@ __all__ = [
     "continuous_actions",
     "from_mjcf",
     "hide",
+    "plan_motion",
     "random_object",
     "random_pushes",
     "randomise_mjx",

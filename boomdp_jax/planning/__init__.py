@@ -18,6 +18,13 @@ from boomdp_jax.planning.leaf import rollout_leaf as rollout_leaf
 from boomdp_jax.planning.learned_leaf import LearnedLeaf as LearnedLeaf
 from boomdp_jax.planning.learned_leaf import learned_leaf as learned_leaf
 from boomdp_jax.planning.mctx_search import mctx_search as mctx_search
+from boomdp_jax.planning.motion import IsFree as IsFree
+from boomdp_jax.planning.motion import PlanMotion as PlanMotion
+from boomdp_jax.planning.motion import TimedMotion as TimedMotion
+from boomdp_jax.planning.motion import edge_points as edge_points
+from boomdp_jax.planning.motion import motion_length as motion_length
+from boomdp_jax.planning.motion import motion_points as motion_points
+from boomdp_jax.planning.motion import timed_motion as timed_motion
 from boomdp_jax.planning.mppi import mppi as mppi
 from boomdp_jax.planning.plan import Plan as Plan
 from boomdp_jax.planning.plan import SearchInfo as SearchInfo
@@ -29,21 +36,28 @@ from boomdp_jax.planning.tree_levels import tree_levels as tree_levels
 __all__ = [
     "Belief",
     "ForwardSearchReport",
+    "IsFree",
     "LearnedLeaf",
     "PathReport",
     "Plan",
+    "PlanMotion",
     "SearchInfo",
+    "TimedMotion",
     "TreeLevel",
     "a_star",
     "certain",
     "cross_entropy_method",
+    "edge_points",
     "forward_search_sparse_sampling",
     "gradient_shooting",
     "learned_leaf",
     "mctx_search",
+    "motion_length",
+    "motion_points",
     "mppi",
     "random_shooting",
     "rollout_leaf",
     "sparse_sampling",
+    "timed_motion",
     "tree_levels",
 ]
