@@ -9,6 +9,10 @@ from boomdp_jax.agents.curiosity import curious as curious
 from boomdp_jax.agents.curiosity import curious_of_pieces as curious_of_pieces
 from boomdp_jax.agents.episode import EpisodeRecord as EpisodeRecord
 from boomdp_jax.agents.episode import run_episode as run_episode
+from boomdp_jax.agents.namo_agent import Character as Character
+from boomdp_jax.agents.namo_agent import NamoPlanner as NamoPlanner
+from boomdp_jax.agents.namo_episode import NamoRecord as NamoRecord
+from boomdp_jax.agents.namo_episode import run_namo as run_namo
 from boomdp_jax.agents.path_agent import make_path_agent as make_path_agent
 from boomdp_jax.agents.piecewise_agent import (
     make_piecewise_agent as make_piecewise_agent,
@@ -17,7 +21,10 @@ from boomdp_jax.agents.restlessness import restless as restless
 
 __all__ = [
     "Agent",
+    "Character",
     "EpisodeRecord",
+    "NamoPlanner",
+    "NamoRecord",
     "can_compile",
     "compile_episode",
     "curious",
@@ -28,4 +35,5 @@ __all__ = [
     "random_agent",
     "restless",
     "run_episode",
+    "run_namo",
 ]

@@ -20,6 +20,9 @@ from boomdp_jax.envs.environment import AbstractEnvironment as AbstractEnvironme
 from boomdp_jax.envs.environment import EnvParams as EnvParams
 from boomdp_jax.envs.environment import EnvState as EnvState
 from boomdp_jax.envs.environment import PlanningHints as PlanningHints
+from boomdp_jax.envs.free_space import FreeSpace as FreeSpace
+from boomdp_jax.envs.free_space import PoseTable as PoseTable
+from boomdp_jax.envs.free_space import pose_table as pose_table
 from boomdp_jax.envs.grasp import GraspReport as GraspReport
 from boomdp_jax.envs.grasp import Grip as Grip
 from boomdp_jax.envs.grasp import grasping_step as grasping_step
@@ -29,6 +32,24 @@ from boomdp_jax.envs.manipulator_planner import ArmMotion as ArmMotion
 from boomdp_jax.envs.manipulator_planner import Manipulation as Manipulation
 from boomdp_jax.envs.manipulator_planner import ManipulatorPlanner as ManipulatorPlanner
 from boomdp_jax.envs.mobile_arm import MobileArm as MobileArm
+from boomdp_jax.envs.namo import NamoInfo as NamoInfo
+from boomdp_jax.envs.namo import NamoReading as NamoReading
+from boomdp_jax.envs.namo import NamoState as NamoState
+from boomdp_jax.envs.namo import NamoWorld as NamoWorld
+from boomdp_jax.envs.namo import grasped as grasped
+from boomdp_jax.envs.namo import is_at_goal as is_at_goal
+from boomdp_jax.envs.namo import make_world as make_world
+from boomdp_jax.envs.namo import namo_step as namo_step
+from boomdp_jax.envs.namo import with_delay as with_delay
+from boomdp_jax.envs.namo_drive import Command as Command
+from boomdp_jax.envs.namo_drive import drive as drive
+from boomdp_jax.envs.namo_drive import going as going
+from boomdp_jax.envs.namo_drive import pushing as pushing
+from boomdp_jax.envs.namo_room import Robot as Robot
+from boomdp_jax.envs.namo_room import Room as Room
+from boomdp_jax.envs.namo_room import Thing as Thing
+from boomdp_jax.envs.namo_room import check_room as check_room
+from boomdp_jax.envs.namo_room import room_scene as room_scene
 from boomdp_jax.envs.pendulum import Pendulum as Pendulum
 from boomdp_jax.envs.walls import Walls as Walls
 from boomdp_jax.envs.walls import stopped_at_walls as stopped_at_walls
@@ -46,9 +67,11 @@ __all__ = [
     "Boxes",
     "Cart",
     "CartWorld",
+    "Command",
     "EnvParams",
     "EnvState",
     "Followed",
+    "FreeSpace",
     "GraspReport",
     "Grip",
     "Held",
@@ -56,18 +79,37 @@ __all__ = [
     "Manipulation",
     "ManipulatorPlanner",
     "MobileArm",
+    "NamoInfo",
+    "NamoReading",
+    "NamoState",
+    "NamoWorld",
     "Pendulum",
     "PlanningHints",
+    "PoseTable",
+    "Robot",
+    "Room",
+    "Thing",
     "Walls",
     "arm_scene",
+    "check_room",
+    "drive",
     "follow_motion",
     "forces_round_circle",
+    "going",
+    "grasped",
     "grasping_step",
+    "is_at_goal",
     "join_actions",
+    "make_world",
+    "namo_step",
     "open_grasp",
+    "pose_table",
+    "pushing",
+    "room_scene",
     "stopped_at_walls",
     "stopped_by_boxes",
     "take_hold",
     "walls_between",
     "way_to",
+    "with_delay",
 ]

@@ -23,6 +23,11 @@ from boomdp_jax.models.point_fit import PointFit as PointFit
 from boomdp_jax.models.regression import AbstractRegressor as AbstractRegressor
 from boomdp_jax.models.regression import BodyRegression as BodyRegression
 from boomdp_jax.models.residual_model import ResidualPhysics as ResidualPhysics
+from boomdp_jax.models.room_belief import FixedRoom as FixedRoom
+from boomdp_jax.models.room_belief import LearntRoom as LearntRoom
+from boomdp_jax.models.room_belief import RoomBelief as RoomBelief
+from boomdp_jax.models.thing_belief import ThingModel as ThingModel
+from boomdp_jax.models.thing_belief import kind_shares as kind_shares
 from boomdp_jax.models.true_model import TrueModel as TrueModel
 
 __all__ = [
@@ -32,9 +37,11 @@ __all__ = [
     "BodyRegression",
     "CmaEs",
     "FixedBelief",
+    "FixedRoom",
     "GaussNewton",
     "GaussianProcess",
     "KnownKinds",
+    "LearntRoom",
     "LinearRegression",
     "LocallyWeighted",
     "MetropolisModel",
@@ -45,7 +52,10 @@ __all__ = [
     "PhysicsModel",
     "PointFit",
     "ResidualPhysics",
+    "RoomBelief",
     "ScenePhysics",
+    "ThingModel",
     "TrueModel",
+    "kind_shares",
     "touched_sectors",
 ]

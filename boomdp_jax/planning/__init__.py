@@ -29,13 +29,23 @@ from boomdp_jax.planning.mppi import mppi as mppi
 from boomdp_jax.planning.plan import Plan as Plan
 from boomdp_jax.planning.plan import SearchInfo as SearchInfo
 from boomdp_jax.planning.random_shooting import random_shooting as random_shooting
+from boomdp_jax.planning.regions import Grid as Grid
+from boomdp_jax.planning.regions import Ways as Ways
+from boomdp_jax.planning.regions import grid_between as grid_between
+from boomdp_jax.planning.regions import label_regions as label_regions
+from boomdp_jax.planning.regions import ways_from as ways_from
 from boomdp_jax.planning.sparse_sampling import sparse_sampling as sparse_sampling
 from boomdp_jax.planning.tree_levels import TreeLevel as TreeLevel
 from boomdp_jax.planning.tree_levels import tree_levels as tree_levels
+from boomdp_jax.planning.trials import Trial as Trial
+from boomdp_jax.planning.trials import best_order as best_order
+from boomdp_jax.planning.trials import region_values as region_values
+from boomdp_jax.planning.trials import worth_of_test as worth_of_test
 
 __all__ = [
     "Belief",
     "ForwardSearchReport",
+    "Grid",
     "IsFree",
     "LearnedLeaf",
     "PathReport",
@@ -44,20 +54,28 @@ __all__ = [
     "SearchInfo",
     "TimedMotion",
     "TreeLevel",
+    "Trial",
+    "Ways",
     "a_star",
+    "best_order",
     "certain",
     "cross_entropy_method",
     "edge_points",
     "forward_search_sparse_sampling",
     "gradient_shooting",
+    "grid_between",
+    "label_regions",
     "learned_leaf",
     "mctx_search",
     "motion_length",
     "motion_points",
     "mppi",
     "random_shooting",
+    "region_values",
     "rollout_leaf",
     "sparse_sampling",
     "timed_motion",
     "tree_levels",
+    "ways_from",
+    "worth_of_test",
 ]

@@ -1,0 +1,355 @@
+"""A robot that gets to its goal, and moves furniture out of its way where it must.
+
+Levels, after Levihn, Scholz and Stilman (2012), Hierarchical decision theoretic
+planning for navigation among movable obstacles:
+
+1. Regions of free space for the robot (`planning.regions`). If the goal is in its own,
+   it goes there on the shortest way.
+2. Else trials: for each thing that alone keeps two regions apart, the probability and
+   the cost of moving it so that they join (`manipulation`), and the order in which to
+   try them (`planning.trials`). Work is linear in the number of things, and what has
+   not changed is not worked out again.
+3. The first of that order: go to the grasp, hold, push and plan anew after each push,
+   on what was learnt from it, until the way is open or hope is lost.
+
+A test push, at the grasp that is nearest, comes first where finding out what a thing is
+pays for itself. How agents differ is in `Character`.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from boomdp_jax.agents.manipulation import (
+    PUSH_SECONDS,
+    Ground,
+    attempt,
+    grasp_sites,
+    ground_of,
+)
+from boomdp_jax.core.arrays import Key
+from boomdp_jax.envs.free_space import FreeSpace, pose_table
+from boomdp_jax.envs.namo_room import Room
+from boomdp_jax.physics.scene import Scene
+from boomdp_jax.physics.state import State
+from boomdp_jax.planning.belief import Belief
+from boomdp_jax.planning.regions import Ways, label_regions, ways_from
+from boomdp_jax.planning.trials import (
+    Trial,
+    best_order,
+    region_values,
+    worth_of_test,
+)
+
+GIVE_UP = 120.0
+"""Cost of not getting to the goal [s]."""
+_NUM_GRASPS = 4
+"""Tried for each thing and pair of regions."""
+_LEAST_REGION = 6
+"""Cells of a region that is worth going through."""
+_NEAR = 0.4
+"""How far the robot may be from a free cell, since it stands at something [m]."""
+
+
+class Character(NamedTuple):
+    """What sets agents apart."""
+
+    name: str
+    learns: bool
+    """Whether pushes change what it believes."""
+    has_tests: bool = False
+    """Whether it may push a thing just to find out what it is."""
+    picks_lightest: bool = False
+    """Whether it takes the lightest thing, whatever that promises."""
+    moves_things: bool = True
+
+
+class Believer(Protocol):
+    """What an agent believes of things."""
+
+    def belief(self, thing: int) -> Belief:
+        """Hypotheses about a thing."""
+        ...
+
+    def version(self, thing: int) -> int:
+        """A number that changes when what is believed of it does."""
+        ...
+
+    def scene(self, thing: int) -> Scene:
+        """The thing alone."""
+        ...
+
+    def mass(self, thing: int) -> float:
+        """Expected [kg]."""
+        ...
+
+
+class Choice(NamedTuple):
+    """What to do next, and why."""
+
+    trial: Trial | None
+    """None: nothing is worth trying."""
+    is_test: bool
+    place: np.ndarray
+    """Of the robot's middle, in the grasp [m]."""
+    ground: Ground | None
+    ways: Ways
+    goal_region: int
+    labels: np.ndarray
+    trials: tuple[Trial, ...]
+    """All that were weighed, from the robot's own region."""
+
+
+class _Site(NamedTuple):
+    """A pair of regions and the thing between them."""
+
+    thing: int
+    start: int
+    end: int
+
+
+class NamoPlanner:
+    """Plans of one robot in one room; remembers what has not changed."""
+
+    def __init__(self, room: Room, character: Character, believer: Believer):
+        """Begin in a room, on what is believed of it."""
+        self.room, self.character = room, character
+        self.believer = believer
+        self.space = FreeSpace(room)
+        self._grounds: dict = {}
+        self._attempts: dict = {}
+
+    def labels(
+        self, poses: Float[np.ndarray, "thing 3"]
+    ) -> tuple[np.ndarray, Bool[np.ndarray, "x y"]]:
+        """Regions, and free cells, with things at some poses."""
+        free = self.space.free(poses)
+        return label_regions(free)[0], free
+
+    def region_at(
+        self, labels: np.ndarray, place: Float[np.ndarray, "2"]
+    ) -> tuple[int, np.ndarray]:
+        """The region of a place, or the nearest one, and its cell there.
+
+        Zero, if there is none near.
+        """
+        away = np.linalg.norm(self.space.places - np.asarray(place), axis=-1)
+        away = np.where(labels > 0, away, np.inf)
+        cell = np.array(np.unravel_index(np.argmin(away), away.shape))
+        if away[tuple(cell)] > _NEAR:
+            return 0, cell
+        return int(labels[tuple(cell)]), cell
+
+    def choose(
+        self,
+        key: Key,
+        state: State,
+        robot: Float[np.ndarray, "2"],
+        avoided: frozenset[int] = frozenset(),
+    ) -> Choice:
+        """What to do from where things and the robot are.
+
+        Args:
+            key: random key.
+            state: as read.
+            robot: its middle [m].
+            avoided: things that are not to be tried now.
+        """
+        num = self.room.num_things
+        poses = np.asarray(state.pose, float)[:num]
+        labels, free = self.labels(poses)
+        here, cell = self.region_at(labels, robot)
+        goal, _ = self.region_at(labels, np.asarray(self.room.goal))
+        ways = ways_from(self.space.grid, free, cell)
+        nothing = Choice(
+            None, False, np.asarray(robot), None, ways, goal, labels, trials=()
+        )
+        if here == goal or not self.character.moves_things or 0 in (here, goal):
+            return nothing
+        found, places, grounds = [], {}, {}
+        for site in _on_the_way(self._sites(poses, labels), here, goal):
+            if site.thing in avoided:
+                continue
+            trial, place, ground = self._trial(key, state, labels, ways, here, site)
+            if trial is not None:
+                found.append(trial)
+                places[trial], grounds[trial] = place, ground
+        if not found:
+            return nothing
+        values = region_values(found, goal, GIVE_UP)
+        own = tuple(trial for trial in found if trial.start == here)
+        order = best_order(own, values, GIVE_UP)
+        if not order.trials:
+            return nothing._replace(trials=own)
+        trial, is_test = order.trials[0], False
+        if self.character.picks_lightest:
+            able = [t for t in own if t.probability > 0.0]
+            trial = min(able, key=lambda t: self.believer.mass(t.thing))
+        elif self.character.has_tests:
+            worth = [worth_of_test(own, t, values, GIVE_UP) for t in order.trials]
+            best = int(np.argmax(worth))
+            if worth[best] > 0.0:
+                trial, is_test = order.trials[best], True
+        place = places[trial][1 if is_test else 0]
+        return Choice(
+            trial, is_test, place, grounds[trial], ways, goal, labels, trials=own
+        )
+
+    def push(
+        self,
+        key: Key,
+        choice: Choice,
+        state: State,
+        robot: Float[np.ndarray, "2"],
+    ) -> tuple[float, np.ndarray]:
+        """The next push of a thing that is held.
+
+        Args:
+            key: random key.
+            choice: what is being done.
+            state: as read.
+            robot: its middle [m].
+
+        Returns:
+            Probability that pushing on opens the way, and the drive `[3]` [N, N, N m].
+        """
+        assert choice.trial is not None
+        assert choice.ground is not None
+        thing = choice.trial.thing
+        lone = State(state.pose[thing][None], state.twist[thing][None])
+        found = attempt(
+            key,
+            self.believer.scene(thing),
+            choice.ground,
+            self.believer.belief(thing),
+            lone,
+            np.asarray(robot, float)[None],
+            self.room.robot,
+            np.zeros(1),
+        )
+        return found.probability, found.action
+
+    def _sites(self, poses: np.ndarray, labels: np.ndarray) -> list[_Site]:
+        """Things that alone keep two regions apart, both ways."""
+        sizes = np.bincount(labels.reshape(-1))
+        found = []
+        for thing in range(self.room.num_things):
+            joined, num = label_regions(self.space.free(poses, without=thing))
+            for region in range(1, num + 1):
+                parts = np.unique(labels[joined == region])
+                parts = [p for p in parts if p > 0 and sizes[p] >= _LEAST_REGION]
+                found += [
+                    _Site(thing, int(one), int(other))
+                    for one in parts
+                    for other in parts
+                    if one != other
+                ]
+        return found
+
+    def _trial(
+        self,
+        key: Key,
+        state: State,
+        labels: np.ndarray,
+        ways: Ways,
+        here: int,
+        site: _Site,
+    ) -> tuple[Trial | None, tuple[np.ndarray, np.ndarray], Ground | None]:
+        """What a thing promises between two regions; its best and nearest grasp."""
+        thing, num = site.thing, self.room.num_things
+        poses = np.asarray(state.pose, float)[:num]
+        sites = grasp_sites(self.space, thing, poses[thing])
+        cells = self.space.grid.cell(sites)
+        is_there = labels[cells[:, 0], cells[:, 1]] == site.start
+        none = np.zeros(2), np.zeros(2)
+        if not is_there.any():
+            return None, none, None
+        places, cells = sites[is_there], cells[is_there]
+        lengths = ways.length[cells[:, 0], cells[:, 1]]
+        if site.start != here:
+            # Where the robot will come from is not known yet.
+            lengths = np.zeros(len(places))
+        seconds = 1.5 * lengths / self.room.robot.speed
+        kept = np.unique(np.linspace(0, len(places) - 1, _NUM_GRASPS).round(), axis=0)
+        kept = kept.astype(int)
+        # With what is told again and again nothing is worked out anew.
+        ground = self._ground(thing, poses, labels, site)
+        where = tuple(np.round(poses[thing] / 0.02).astype(int))
+        name = (thing, self.believer.version(thing), where, id(ground), len(places))
+        if name not in self._attempts:
+            lone = State(state.pose[thing][None], 0.0 * state.twist[thing][None])
+            self._attempts[name] = attempt(
+                key,
+                self.believer.scene(thing),
+                ground,
+                self.believer.belief(thing),
+                lone,
+                places[kept],
+                self.room.robot,
+                seconds[kept],
+            )
+        found = self._attempts[name]
+        if found.probability <= 0.0:
+            return None, none, None
+        grasp, nearest = kept[found.grasp], int(np.argmin(seconds))
+        trial = Trial(
+            thing=thing,
+            start=site.start,
+            end=site.end,
+            probability=found.probability,
+            cost=float(seconds[grasp]) + found.cost,
+            loss=2.0 * float(seconds[grasp]) + 2.0 * PUSH_SECONDS,
+            test=2.0 * float(seconds[nearest]) + PUSH_SECONDS,
+        )
+        return trial, (places[grasp], places[nearest]), ground
+
+    def _ground(
+        self, thing: int, poses: np.ndarray, labels: np.ndarray, site: _Site
+    ) -> Ground:
+        """Maps for moving a thing; the same object as long as nothing else moved."""
+        others = np.delete(np.round(poses / 0.02).astype(int), thing, axis=0)
+        start, end = labels == site.start, labels == site.end
+        # Regions change their numbers, and their cells next to the thing; what they
+        # are without it does not.
+        base, _ = label_regions(self.space.free(poses, without=thing))
+        ends = np.unique(base[start]).tobytes(), np.unique(base[end]).tobytes()
+        corner = _first_cell(start), _first_cell(end)
+        own = np.round((poses[thing]) / 0.5).astype(int).tobytes()
+        name = (thing, others.tobytes(), own, ends, corner)
+        if name not in self._grounds:
+            table = pose_table(self.space, thing, poses, start, end)
+            free = self.space.free(poses, without=thing)
+            self._grounds[name] = ground_of(self.space, table, free)
+        return self._grounds[name]
+
+
+def _first_cell(cells: np.ndarray) -> int:
+    return int(np.argmax(cells))
+
+
+def _on_the_way(sites: Sequence[_Site], here: int, goal: int) -> list[_Site]:
+    """Those on ways to the goal with at most one region more than the shortest."""
+    ahead = _hops([(s.start, s.end) for s in sites], here)
+    back = _hops([(s.end, s.start) for s in sites], goal)
+    least = ahead.get(goal, math.inf)
+    return [
+        site
+        for site in sites
+        if ahead.get(site.start, math.inf) + 1 + back.get(site.end, math.inf)
+        <= least + 1
+        and site.start != goal
+        and site.end != here
+    ]
+
+
+def _hops(edges: Sequence[tuple[int, int]], start: int) -> dict[int, int]:
+    """Fewest edges from a region to each other."""
+    found, rim = {start: 0}, [start]
+    while rim:
+        rim = sorted({b for a, b in edges if a in rim and b not in found})
+        for region in rim:
+            found[region] = 1 + max(found.values())
+    return found

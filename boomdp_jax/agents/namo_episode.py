@@ -1,0 +1,295 @@
+"""One robot in one room, from the start to the goal or to giving up."""
+
+import time
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from boomdp_jax.agents.namo_agent import Character, Choice, NamoPlanner
+from boomdp_jax.core.arrays import Key
+from boomdp_jax.envs.namo import (
+    NOBODY,
+    NamoState,
+    NamoWorld,
+    grasped,
+    is_at_goal,
+    make_world,
+)
+from boomdp_jax.envs.namo_drive import (
+    NUM_STEPS,
+    Command,
+    Driven,
+    drive,
+    going,
+    pushing,
+)
+from boomdp_jax.envs.namo_room import TIME_STEP, Room
+from boomdp_jax.models.room_belief import RoomBelief
+from boomdp_jax.models.thing_belief import Row
+from boomdp_jax.physics.state import State
+
+LONGEST = 150.0
+"""Seconds of simulated time after which an episode is over."""
+_MOST_PUSHES = 16
+"""Of one attempt."""
+_LEAST_HOPE = 0.1
+"""Probability below which an attempt is broken off."""
+_STUCK = 3
+"""Pushes in a row that move nothing, after which one who does not learn gives up."""
+_STIR = 0.03
+"""What counts as moving [m]."""
+_NEAR = 0.02
+"""How near the robot has to come to its grasp [m]."""
+
+_grasped = jax.jit(grasped)
+_is_at_goal = jax.jit(is_at_goal)
+
+
+class Try(NamedTuple):
+    """One attempt at moving a thing, or one test."""
+
+    thing: int
+    is_test: bool
+    num_pushes: int
+    opened: bool
+    """Whether the robot's region was joined to another one then."""
+    promised: float
+    """Probability of that, before."""
+    begin: int
+    """Steps of the world since the start, when it began and when it ended."""
+    end: int
+    shares: tuple[dict[str, float], ...]
+    """What was believed of the thing, before and after each push: share of each kind
+    (`kind_shares`); empty for who has no belief."""
+
+
+class NamoRecord(NamedTuple):
+    """All that happened."""
+
+    is_solved: bool
+    """The robot's body is at its goal and overlaps nothing."""
+    seconds: float
+    """Of simulated time."""
+    effort: float
+    """Mean force over the greatest, times time [s]."""
+    num_pushes: int
+    num_wasted: int
+    """Pushes of tries that opened nothing."""
+    tries: tuple[Try, ...]
+    poses: np.ndarray
+    """True ones after each step of the world, `[time, body, 3]`."""
+    decision_seconds: np.ndarray
+    """Of real time, for learning and planning anew after each push or try."""
+    most_force: float
+    """Transmitted by the grasp [N]."""
+    most_overlap: float
+    """Of any two outlines [m]."""
+
+
+class _Episode:
+    """What goes on while the robot is at it."""
+
+    def __init__(self, key: Key, room: Room, character: Character, belief: RoomBelief):
+        self.key, self.room, self.character = key, room, character
+        self.world, self.state = make_world(room)
+        self.belief = belief
+        self.planner = NamoPlanner(room, character, belief)
+        self.read: State = self.state.physics
+        self.poses = [np.asarray(self.state.physics.pose)[None]]
+        self.tries: list[Try] = []
+        self.seconds: list[float] = []
+        self.effort = self.most_force = self.most_overlap = 0.0
+        self.num_steps = 0
+
+    @property
+    def robot(self) -> np.ndarray:
+        """Where it reads itself to be."""
+        return np.asarray(self.read.pose, float)[self.room.num_things, :2]
+
+    @property
+    def is_over(self) -> bool:
+        """Whether time is up."""
+        return self.num_steps * TIME_STEP >= LONGEST
+
+    def split(self) -> Key:
+        """A fresh key."""
+        self.key, key = jax.random.split(self.key)
+        return key
+
+    def carry_out(self, command: Command) -> Driven:
+        """Drive, and keep count."""
+        self.state, driven = drive(self.split(), self.world, self.state, command)
+        self.read = jax.tree.map(lambda leaf: leaf[-1], driven.reading.after)
+        self.poses.append(np.asarray(driven.place))
+        self.effort += float(driven.effort)
+        self.most_force = max(self.most_force, float(driven.force))
+        self.most_overlap = max(self.most_overlap, float(driven.overlap))
+        self.num_steps += NUM_STEPS
+        return driven
+
+    def go(self, way: np.ndarray, near: float) -> bool:
+        """Along a way; whether its end was reached."""
+        command = going(way, self.room.robot.speed)
+        length = float(np.sum(np.linalg.norm(np.diff(way, axis=0), axis=-1)))
+        allowed = 2.0 * length / self.room.robot.speed + 6.0
+        for _ in range(int(np.ceil(allowed / (NUM_STEPS * TIME_STEP)))):
+            if np.linalg.norm(self.robot - way[-1]) < near:
+                return True
+            if self.is_over:
+                break
+            self.carry_out(command)
+        return bool(np.linalg.norm(self.robot - way[-1]) < near)
+
+    def decide(self, avoided: frozenset[int]) -> Choice:
+        """Choose, and keep the time."""
+        begin = time.perf_counter()
+        choice = self.planner.choose(self.split(), self.read, self.robot, avoided)
+        self.seconds.append(time.perf_counter() - begin)
+        return choice
+
+    def attempt(self, choice: Choice) -> bool:
+        """Go, hold and push; whether regions were joined."""
+        trial = choice.trial
+        assert trial is not None
+        begin, shares = self.num_steps, [self.belief.shares(trial.thing)]
+        cell = self.planner.space.grid.cell(choice.place)
+        way = choice.ways.path_to(cell)
+        num_pushes, opened = 0, False
+        if way is not None:
+            self.go(np.concatenate([way, choice.place[None]]), _NEAR)
+            self.state = _grasped(self.world, self.state, trial.thing)
+            if int(self.state.held) != NOBODY:
+                num_pushes, opened = self._push_on(choice, shares)
+        self.state = _grasped(self.world, self.state, NOBODY)
+        self.tries.append(
+            Try(
+                thing=trial.thing,
+                is_test=choice.is_test,
+                num_pushes=num_pushes,
+                opened=opened,
+                promised=trial.probability,
+                begin=begin,
+                end=self.num_steps,
+                shares=tuple(shares),
+            )
+        )
+        return opened
+
+    def _push_on(self, choice: Choice, shares: list) -> tuple[int, bool]:
+        """Push by push, learning and planning anew after each."""
+        trial = choice.trial
+        assert trial is not None
+        num_still, begin = 0, time.perf_counter()
+        for num in range(1 if choice.is_test else _MOST_PUSHES):
+            hope, action = self.planner.push(
+                self.split(), choice, self.read, self.robot
+            )
+            self.seconds.append(time.perf_counter() - begin)
+            is_stuck = not self.character.learns and num_still >= _STUCK
+            if self.is_over or (num > 0 and (hope < _LEAST_HOPE or is_stuck)):
+                return num, False
+            before = np.asarray(self.read.pose, float)[trial.thing]
+            driven = self.carry_out(pushing(jnp.asarray(action, float)))
+            begin = time.perf_counter()
+            after = np.asarray(self.read.pose, float)[trial.thing]
+            moved = np.linalg.norm(after[:2] - before[:2])
+            moved += self.room.things[trial.thing].reach * abs(after[2] - before[2])
+            num_still = num_still + 1 if moved < _STIR else 0
+            self._learn(trial.thing, driven, is_new=num == 0)
+            shares.append(self.belief.shares(trial.thing))
+            if self._is_joined(choice):
+                return num + 1, True
+            if int(self.state.held) == NOBODY:
+                return num + 1, False
+        return (1 if choice.is_test else _MOST_PUSHES), False
+
+    def _learn(self, thing: int, driven: Driven, *, is_new: bool) -> None:
+        if not self.character.learns:
+            return
+        reading = driven.reading
+        held = np.asarray(reading.held) == thing
+        rows = []
+        for index in np.flatnonzero(held):
+            before, after = (
+                State(part.pose[index, thing][None], part.twist[index, thing][None])
+                for part in (reading.before, reading.after)
+            )
+            rows.append(Row(before, reading.wrench[index][None], after))
+        if rows:
+            self.belief.update(self.split(), thing, rows, is_new=is_new)
+
+    def _is_joined(self, choice: Choice) -> bool:
+        """Whether the robot can get from where it is to where it wanted to."""
+        trial = choice.trial
+        assert trial is not None
+        num = self.room.num_things
+        poses = np.asarray(self.read.pose, float)[:num]
+        labels, _ = self.planner.labels(poses)
+        here, _ = self.planner.region_at(labels, self.robot)
+        aimed = (choice.labels == trial.end) & (labels > 0)
+        return here > 0 and bool(np.any(labels[aimed] == here))
+
+
+def run_namo(
+    key: Key, room: Room, character: Character, belief: RoomBelief
+) -> NamoRecord:
+    """Let a robot get to its goal.
+
+    Args:
+        key: random key; all that happens is decided by it.
+        room: the room, the truth included.
+        character: what sort of agent it is.
+        belief: what it believes of the room's things; changed by what it learns.
+
+    Returns:
+        What happened.
+    """
+    episode = _Episode(key, room, character, belief)
+    avoided: set[int] = set()
+    count = np.zeros(room.num_things, int)
+    while not episode.is_over:
+        choice = episode.decide(frozenset(avoided))
+        labels = choice.labels
+        here, _ = episode.planner.region_at(labels, episode.robot)
+        if here == choice.goal_region and here > 0:
+            way = choice.ways.path_to(
+                episode.planner.space.grid.cell(np.asarray(room.goal))
+            )
+            if way is None:
+                break
+            if episode.go(np.concatenate([way, np.asarray(room.goal)[None]]), 0.05):
+                break
+            continue
+        if choice.trial is None:
+            # What did not work may work yet, if nothing else is left.
+            again = {t for t in avoided if count[t] < 3}
+            if not again:
+                break
+            avoided -= again
+            continue
+        thing = choice.trial.thing
+        opened = episode.attempt(choice)
+        if opened:
+            avoided.clear()
+        elif not choice.is_test:
+            count[thing] += 1
+            avoided.add(thing)
+    return _record(episode, episode.world, episode.state)
+
+
+def _record(episode: _Episode, world: NamoWorld, state: NamoState) -> NamoRecord:
+    tries = tuple(episode.tries)
+    return NamoRecord(
+        is_solved=bool(_is_at_goal(world, state)),
+        seconds=episode.num_steps * TIME_STEP,
+        effort=episode.effort,
+        num_pushes=sum(one.num_pushes for one in tries),
+        num_wasted=sum(one.num_pushes for one in tries if not one.opened),
+        tries=tries,
+        poses=np.concatenate(episode.poses),
+        decision_seconds=np.array(episode.seconds),
+        most_force=episode.most_force,
+        most_overlap=episode.most_overlap,
+    )

@@ -1,0 +1,161 @@
+"""What is believed of all things of a room, each by itself.
+
+Whoever knows the truth, or does not learn, believes the same from beginning to end;
+`LearntRoom` keeps a `ThingModel` for each thing.
+"""
+
+import abc
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from boomdp_jax.core.arrays import Key
+from boomdp_jax.envs.namo_room import Room, thing_scene
+from boomdp_jax.models.thing_belief import (
+    NUM_HYPOTHESES,
+    Row,
+    ThingLearnt,
+    ThingModel,
+    kind_shares,
+)
+from boomdp_jax.physics.params import Params
+from boomdp_jax.physics.scene import Scene
+from boomdp_jax.planning.belief import Belief
+
+
+class RoomBelief(abc.ABC):
+    """Hypotheses about each thing."""
+
+    @abc.abstractmethod
+    def belief(self, thing: int) -> Belief:
+        """Hypotheses about a thing."""
+
+    @abc.abstractmethod
+    def version(self, thing: int) -> int:
+        """A number that changes when what is believed of it does."""
+
+    @abc.abstractmethod
+    def scene(self, thing: int) -> Scene:
+        """The thing alone."""
+
+    @abc.abstractmethod
+    def update(
+        self, key: Key, thing: int, rows: Sequence[Row], *, is_new: bool
+    ) -> None:
+        """Learn from one push."""
+
+    @abc.abstractmethod
+    def shares(self, thing: int) -> dict[str, float]:
+        """Probability of each kind of thing."""
+
+    def mass(self, thing: int) -> float:
+        """Expected mass of a thing [kg]."""
+        belief = self.belief(thing)
+        density = np.asarray(belief.hypotheses.density, float).reshape(-1)
+        area = float(self.scene(thing).area[0])
+        return area * float(density @ np.asarray(belief.weight, float))
+
+
+class FixedRoom(RoomBelief):
+    """One who does not learn."""
+
+    def __init__(self, room: Room, hypotheses: Sequence[Params]):
+        """Believe the same throughout.
+
+        Args:
+            room: what can be seen of it.
+            hypotheses: about each thing, leading axis `hypothesis`.
+        """
+        self._scenes = [thing_scene(thing).scene for thing in room.things]
+        self._beliefs = [
+            Belief(one, jnp.zeros(one.density.shape[0])) for one in hypotheses
+        ]
+        self._force = room.robot.force
+
+    def belief(self, thing: int) -> Belief:
+        """Always the same."""
+        return self._beliefs[thing]
+
+    def version(self, thing: int) -> int:
+        """Never changes."""
+        del thing
+        return 0
+
+    def scene(self, thing: int) -> Scene:
+        """The thing alone."""
+        return self._scenes[thing]
+
+    def update(
+        self, key: Key, thing: int, rows: Sequence[Row], *, is_new: bool
+    ) -> None:
+        """Nothing is learnt."""
+
+    def shares(self, thing: int) -> dict[str, float]:
+        """Probability of each kind of thing."""
+        belief = self._beliefs[thing]
+        return kind_shares(
+            belief.hypotheses,
+            self._scenes[thing],
+            self._force,
+            np.asarray(belief.weight),
+        )
+
+
+class LearntRoom(RoomBelief):
+    """An online posterior of each thing; untouched ones have their priors."""
+
+    def __init__(self, key: Key, room: Room, *, is_point: bool = False):
+        """Begin with priors.
+
+        Args:
+            key: random key.
+            room: what can be seen of it.
+            is_point: whether only the most probable hypothesis is believed.
+        """
+        self._models = [ThingModel(thing_scene(thing)) for thing in room.things]
+        keys = jax.random.split(key, len(self._models))
+        self._learnt: list[ThingLearnt] = [
+            model.init(each) for model, each in zip(self._models, keys, strict=True)
+        ]
+        self._force = room.robot.force
+        self._is_point = is_point
+
+    def belief(self, thing: int) -> Belief:
+        """Draws of the posterior; or the most probable structure's best numbers."""
+        learnt = self._learnt[thing]
+        if not self._is_point:
+            return Belief(learnt.draws, jnp.zeros(NUM_HYPOTHESES))
+        best = self._models[thing].online.best_params(learnt.belief)
+        return Belief(
+            jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], best), jnp.zeros(1)
+        )
+
+    def version(self, thing: int) -> int:
+        """Pushes that were learnt from."""
+        return self._learnt[thing].num_pushes
+
+    def scene(self, thing: int) -> Scene:
+        """The thing alone."""
+        return self._models[thing].scene
+
+    def update(
+        self, key: Key, thing: int, rows: Sequence[Row], *, is_new: bool
+    ) -> None:
+        """Learn from one push."""
+        self._learnt[thing] = self._models[thing].update(
+            key, self._learnt[thing], rows, is_new=is_new
+        )
+
+    def shares(self, thing: int) -> dict[str, float]:
+        """Probability of each kind of thing."""
+        model, learnt = self._models[thing], self._learnt[thing]
+        posterior = model.online.posterior(learnt.belief)
+        return kind_shares(
+            posterior.params, model.scene, self._force, posterior.weights
+        )
+
+    def structure(self, thing: int) -> dict[str, float]:
+        """Probability of each kind of constraint on a thing."""
+        return self._models[thing].structure(self._learnt[thing])
