@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from boomdp_jax.agents.manipulation import (
+    NOT_OPENED,
     PUSH_SECONDS,
     Ground,
     attempt,
@@ -44,13 +45,18 @@ from boomdp_jax.planning.trials import (
     worth_of_test,
 )
 
-GIVE_UP = 120.0
+COVERED = -1
+"""Region of the goal, while a thing stands on it."""
+GIVE_UP = 600.0
 """Cost of not getting to the goal [s]."""
+_LEAST_CHANCE = 0.01
+"""That a thing can be moved although no plan was found: plans look some seconds ahead
+and from a few grasps."""
 _NUM_GRASPS = 4
 """Tried for each thing and pair of regions."""
 _LEAST_REGION = 6
 """Cells of a region that is worth going through."""
-_NEAR = 0.4
+_NEAR = 0.6
 """How far the robot may be from a free cell, since it stands at something [m]."""
 
 
@@ -119,6 +125,7 @@ class NamoPlanner:
         self.room, self.character = room, character
         self.believer = believer
         self.space = FreeSpace(room)
+        self.goal_cell = self.space.grid.cell(np.asarray(room.goal))
         self._grounds: dict = {}
         self._attempts: dict = {}
 
@@ -162,15 +169,16 @@ class NamoPlanner:
         poses = np.asarray(state.pose, float)[:num]
         labels, free = self.labels(poses)
         here, cell = self.region_at(labels, robot)
-        goal, _ = self.region_at(labels, np.asarray(self.room.goal))
+        # Where a thing stands on the goal, that is a region by itself.
+        goal = int(labels[tuple(self.goal_cell)]) or COVERED
         ways = ways_from(self.space.grid, free, cell)
         nothing = Choice(
             None, False, np.asarray(robot), None, ways, goal, labels, trials=()
         )
-        if here == goal or not self.character.moves_things or 0 in (here, goal):
+        if here in (0, goal) or not self.character.moves_things:
             return nothing
         found, places, grounds = [], {}, {}
-        for site in _on_the_way(self._sites(poses, labels), here, goal):
+        for site in _on_the_way(self._sites(poses, labels, here), here, goal):
             if site.thing in avoided:
                 continue
             trial, place, ground = self._trial(key, state, labels, ways, here, site)
@@ -232,15 +240,20 @@ class NamoPlanner:
         )
         return found.probability, found.action
 
-    def _sites(self, poses: np.ndarray, labels: np.ndarray) -> list[_Site]:
+    def _sites(self, poses: np.ndarray, labels: np.ndarray, here: int) -> list[_Site]:
         """Things that alone keep two regions apart, both ways."""
         sizes = np.bincount(labels.reshape(-1))
+        # However small it is, the robot is in it.
+        sizes[here] = max(sizes[here], _LEAST_REGION)
         found = []
         for thing in range(self.room.num_things):
             joined, num = label_regions(self.space.free(poses, without=thing))
+            at_goal = joined[tuple(self.goal_cell)]
             for region in range(1, num + 1):
                 parts = np.unique(labels[joined == region])
                 parts = [p for p in parts if p > 0 and sizes[p] >= _LEAST_REGION]
+                if region == at_goal and not labels[tuple(self.goal_cell)]:
+                    found += [_Site(thing, int(one), COVERED) for one in parts]
                 found += [
                     _Site(thing, int(one), int(other))
                     for one in parts
@@ -292,15 +305,21 @@ class NamoPlanner:
                 seconds[kept],
             )
         found = self._attempts[name]
-        if found.probability <= 0.0:
-            return None, none, None
         grasp, nearest = kept[found.grasp], int(np.argmin(seconds))
+        # Of a few draws none may move it although it can be moved.
+        num_draws = self.believer.belief(thing).num_hypotheses
+        probability, cost = found.probability, found.cost
+        if num_draws > 1:
+            probability = (num_draws * probability + 0.5) / (num_draws + 1.0)
+        probability = max(probability, _LEAST_CHANCE)
+        if not math.isfinite(cost):
+            cost = NOT_OPENED
         trial = Trial(
             thing=thing,
             start=site.start,
             end=site.end,
-            probability=found.probability,
-            cost=float(seconds[grasp]) + found.cost,
+            probability=probability,
+            cost=float(seconds[grasp]) + cost,
             loss=2.0 * float(seconds[grasp]) + 2.0 * PUSH_SECONDS,
             test=2.0 * float(seconds[nearest]) + PUSH_SECONDS,
         )
@@ -312,6 +331,10 @@ class NamoPlanner:
         """Maps for moving a thing; the same object as long as nothing else moved."""
         others = np.delete(np.round(poses / 0.02).astype(int), thing, axis=0)
         start, end = labels == site.start, labels == site.end
+        keep = np.zeros_like(start)
+        keep[tuple(self.goal_cell)] = True
+        if site.end == COVERED:
+            end = keep
         # Regions change their numbers, and their cells next to the thing; what they
         # are without it does not.
         base, _ = label_regions(self.space.free(poses, without=thing))
@@ -320,7 +343,7 @@ class NamoPlanner:
         own = np.round((poses[thing]) / 0.5).astype(int).tobytes()
         name = (thing, others.tobytes(), own, ends, corner)
         if name not in self._grounds:
-            table = pose_table(self.space, thing, poses, start, end)
+            table = pose_table(self.space, thing, poses, start, end, keep=keep)
             free = self.space.free(poses, without=thing)
             self._grounds[name] = ground_of(self.space, table, free)
         return self._grounds[name]

@@ -7,7 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from boomdp_jax.agents.namo_agent import Character, Choice, NamoPlanner
+from boomdp_jax.agents.namo_agent import (
+    COVERED,
+    Character,
+    Choice,
+    NamoPlanner,
+)
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.envs.namo import (
     NOBODY,
@@ -37,7 +42,7 @@ _MOST_PUSHES = 16
 _LEAST_HOPE = 0.1
 """Probability below which an attempt is broken off."""
 _STUCK = 3
-"""Pushes in a row that move nothing, after which one who does not learn gives up."""
+"""Pushes in a row that move nothing, after which an attempt is broken off."""
 _STIR = 0.03
 """What counts as moving [m]."""
 _NEAR = 0.02
@@ -187,7 +192,7 @@ class _Episode:
                 self.split(), choice, self.read, self.robot
             )
             self.seconds.append(time.perf_counter() - begin)
-            is_stuck = not self.character.learns and num_still >= _STUCK
+            is_stuck = num_still >= _STUCK
             if self.is_over or (num > 0 and (hope < _LEAST_HOPE or is_stuck)):
                 return num, False
             before = np.asarray(self.read.pose, float)[trial.thing]
@@ -228,8 +233,11 @@ class _Episode:
         poses = np.asarray(self.read.pose, float)[:num]
         labels, _ = self.planner.labels(poses)
         here, _ = self.planner.region_at(labels, self.robot)
+        goal = labels[tuple(self.planner.goal_cell)]
+        if trial.end == COVERED:
+            return here > 0 and goal == here
         aimed = (choice.labels == trial.end) & (labels > 0)
-        return here > 0 and bool(np.any(labels[aimed] == here))
+        return here > 0 and goal > 0 and bool(np.any(labels[aimed] == here))
 
 
 def run_namo(

@@ -15,7 +15,7 @@ LIKELIHOODS = ("auto", "filtered", "one-step", "open-loop")
 """Likelihoods of readings that exist."""
 
 
-TASKS = ("pendulum", "cart", "acrobot", "living-room")
+TASKS = ("pendulum", "cart", "acrobot", "living-room", "namo")
 """Tasks of `run`."""
 
 AGENTS = (
@@ -38,8 +38,13 @@ AGENTS = (
     "physics-kinds",
     "papers",
     "random",
+    "prior",
+    "optimistic",
+    "lightest",
+    "navigation",
 )
-"""Agents of `run`."""
+"""Agents of `run`; the last four, and no others but `true`, `physics` and
+`physics-map`, do namo."""
 
 WORLDS = ("as-told", "dry", "off-centre", "caster", "large", "box")
 """Worlds of the cart."""
@@ -193,6 +198,9 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     add("--world", choices=WORLDS, help="of the cart: what is not as agents are told")
     add("--seeds", type=_whole(1), default=20, metavar="N", help="episodes: 0 to N - 1")
     add("--steps", type=_whole(1), metavar="T", help="of each; default: the task's")
+    add("--room", choices=("random", "story"), help="of namo; default: random")
+    add("--things", type=_whole(2), metavar="K", help="of namo: in a random room; 4")
+    add("--difficulty", type=_scale, metavar="D", help="of namo: from 0 to 1; 0.5")
     add(
         "--out",
         required=True,

@@ -6,6 +6,8 @@ import sys
 import numpy as np
 
 from boomdp_jax.agents.episode import EpisodeRecord
+from boomdp_jax.agents.namo_episode import NamoRecord
+from boomdp_jax.experiments.namo_run import begin_namo
 from boomdp_jax.experiments.run import Run, begin_run
 
 
@@ -18,6 +20,15 @@ def run(arguments: argparse.Namespace) -> None:
     Raises:
         ValueError: bad input, or a folder of another run.
     """
+    if arguments.task == "namo":
+        _run_namo(arguments)
+        return
+    for name in ("room", "things", "difficulty"):
+        if getattr(arguments, name) is not None:
+            raise ValueError(
+                f"--{name}: expected none for {arguments.task}, which is no room to "
+                f"choose; got {getattr(arguments, name)}"
+            )
     begun = begin_run(
         arguments.task,
         arguments.agent,
@@ -37,6 +48,51 @@ def run(arguments: argparse.Namespace) -> None:
     print(
         f"{begun.task}, {begun.agent}: return {total.mean():.1f} +- {error:.1f} "
         f"(standard error, {len(total)} seeds); {begun.folder / 'results.npz'}"
+    )
+
+
+def _run_namo(arguments: argparse.Namespace) -> None:
+    """A robot among furniture, room by room."""
+    for name in ("steps", "noise", "world"):
+        if getattr(arguments, name) is not None:
+            raise ValueError(
+                f"--{name}: expected none for namo, got {getattr(arguments, name)}"
+            )
+    given = {
+        "room": arguments.room,
+        "num_things": arguments.things,
+        "difficulty": arguments.difficulty,
+    }
+    begun = begin_namo(
+        arguments.agent,
+        arguments.out,
+        num_seeds=arguments.seeds,
+        **{name: value for name, value in given.items() if value is not None},
+    )
+    seeds = begun.missing(arguments.shard or (0, 1))
+    count = 0
+
+    def report(seed: int, record: NamoRecord) -> None:
+        nonlocal count
+        count += 1
+        end = "solved" if record.is_solved else "not solved"
+        print(
+            f"[{'#' * (20 * count // len(seeds)):<20}] {count}/{len(seeds)} "
+            f"seed {seed}: {end} in {record.seconds:.0f} s, {record.num_pushes} "
+            f"pushes, {record.num_wasted} of them wasted",
+            file=sys.stderr,
+        )
+
+    begun.run_seeds(seeds, report)
+    results = begun.collect()
+    if results is None:
+        missing = len(begun.missing())
+        print(f"{missing} seeds are missing, of other shards", file=sys.stderr)
+        return
+    print(
+        f"namo, {begun.agent}: {results['is_solved'].sum()} of {begun.num_seeds} rooms "
+        f"solved, {results['num_wasted'].mean():.1f} wasted pushes, "
+        f"{results['seconds'].mean():.0f} s; {begun.folder / 'results.npz'}"
     )
 
 

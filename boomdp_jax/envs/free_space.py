@@ -150,6 +150,8 @@ def pose_table(
     poses: Float[np.ndarray, "thing 3"],
     start: Bool[np.ndarray, "x y"],
     end: Bool[np.ndarray, "x y"],
+    *,
+    keep: Bool[np.ndarray, "x y"] | None = None,
 ) -> PoseTable:
     """Look at all poses of a thing round where it is.
 
@@ -159,6 +161,7 @@ def pose_table(
         poses: of all things now.
         start: cells of the region in which the robot is.
         end: cells of the region that it is to get to.
+        keep: cells that the thing must not close, such as the goal's.
 
     Returns:
         The table; of a disc with one angle.
@@ -178,7 +181,9 @@ def pose_table(
     base = space.free(poses, without=thing)
     opened = np.stack(
         [
-            _connected(space, outline, np.append(now[:2], angle), base, start, end)
+            _connected(
+                space, outline, np.append(now[:2], angle), base, (start, end, keep)
+            )
             for angle in angles
         ]
     )
@@ -204,8 +209,7 @@ def _connected(
     outline: Outline,
     pose: Float[np.ndarray, "3"],
     base: Bool[np.ndarray, "x y"],
-    start: Bool[np.ndarray, "x y"],
-    end: Bool[np.ndarray, "x y"],
+    regions: tuple,
 ) -> Bool[np.ndarray, "x y"]:
     """Whether the regions are joined, for each place of the thing round a pose.
 
@@ -229,8 +233,13 @@ def _connected(
     x, y = grid.shape
     # Shifted by so much, the thing closes what it closes there now.
     closed = np.stack([[near[i : i + x, j : j + y] for j in shifts] for i in shifts])
-    free = words(base) & ~words(closed)
-    return np.any(reached(free, words(start)) & words(end) & free != 0, axis=-1)
+    closed = words(closed)
+    free = words(base) & ~closed
+    start, end, keep = regions
+    joined = np.any(reached(free, words(start)) & words(end) & free != 0, axis=-1)
+    if keep is None:
+        return joined
+    return joined & ~np.any(closed & words(keep) != 0, axis=-1)
 
 
 def _distance_in_frame(away: np.ndarray, angle: np.ndarray, outline) -> np.ndarray:

@@ -9,6 +9,8 @@ import numpy as np
 
 from boomdp_jax.core.json_file import read_json
 from boomdp_jax.core.npz_file import read_npz
+from boomdp_jax.envs.namo_room import TIME_STEP, room_params, room_scene
+from boomdp_jax.experiments.namo import make_room
 from boomdp_jax.experiments.registry import make_task
 from boomdp_jax.experiments.run import SCHEMA
 from boomdp_jax.physics.params import Params
@@ -63,6 +65,8 @@ def replay(folder: str | os.PathLike, seed: int | None = None) -> Replay:
             f"done, got {shown}"
         )
     record = read_npz(folder / f"seed-{shown:05d}.npz")
+    if content["task"] == "namo":
+        return _replay_room(content, record["poses"], shown)
     states = record["state"][record["action"] >= 0]
     if not len(states):
         raise ValueError(f"{folder}: episode {shown}: expected a step, got none")
@@ -79,6 +83,21 @@ def replay(folder: str | os.PathLike, seed: int | None = None) -> Replay:
         dt / num_parts,
         task.default_params().physics if task.seen_spec is task.spec else None,
         f"{content['task']}, {content['agent']}, episode {shown}",
+    )
+
+
+def _replay_room(content: dict, poses: np.ndarray, seed: int) -> Replay:
+    """A robot among furniture."""
+    room = make_room(
+        content["room"], seed, content["num_things"], content["difficulty"]
+    )
+    spec = room_scene(room)
+    return Replay(
+        spec,
+        State(jnp.asarray(poses, float), jnp.zeros(poses.shape)),
+        TIME_STEP,
+        room_params(room, spec),
+        f"namo, {content['agent']}, room {seed}",
     )
 
 

@@ -13,6 +13,8 @@ import numpy as np
 
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.envs.namo_room import Room, thing_scene
+from boomdp_jax.inference.noise import host_generator
+from boomdp_jax.models.kin import kin_draws, kin_odds
 from boomdp_jax.models.thing_belief import (
     NUM_HYPOTHESES,
     Row,
@@ -23,6 +25,9 @@ from boomdp_jax.models.thing_belief import (
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.planning.belief import Belief
+
+# Odds of being of a kind that was tried, below which a thing is left as it was.
+_LEAST_ODDS = 0.1
 
 
 class RoomBelief(abc.ABC):
@@ -104,28 +109,36 @@ class FixedRoom(RoomBelief):
 
 
 class LearntRoom(RoomBelief):
-    """An online posterior of each thing; untouched ones have their priors."""
+    """An online posterior of each thing; of untouched ones, what their kin tell."""
 
-    def __init__(self, key: Key, room: Room, *, is_point: bool = False):
+    def __init__(
+        self, key: Key, room: Room, *, is_point: bool = False, shares: bool = True
+    ):
         """Begin with priors.
 
         Args:
             key: random key.
             room: what can be seen of it.
             is_point: whether only the most probable hypothesis is believed.
+            shares: whether what was learnt of one thing tells of others like it.
         """
+        self._rng = host_generator(jax.random.fold_in(key, 1))
+        self._shares = shares
         self._models = [ThingModel(thing_scene(thing)) for thing in room.things]
         keys = jax.random.split(key, len(self._models))
         self._learnt: list[ThingLearnt] = [
             model.init(each) for model, each in zip(self._models, keys, strict=True)
         ]
+        self._prior = [learnt.draws for learnt in self._learnt]
+        self._num_told = [0] * len(self._learnt)
+        self._num_labels = max(len({thing.label for thing in room.things}), 2)
         self._force = room.robot.force
         self._is_point = is_point
 
     def belief(self, thing: int) -> Belief:
         """Draws of the posterior; or the most probable structure's best numbers."""
         learnt = self._learnt[thing]
-        if not self._is_point:
+        if not self._is_point or self._num_told[thing]:
             return Belief(learnt.draws, jnp.zeros(NUM_HYPOTHESES))
         best = self._models[thing].online.best_params(learnt.belief)
         return Belief(
@@ -133,8 +146,8 @@ class LearntRoom(RoomBelief):
         )
 
     def version(self, thing: int) -> int:
-        """Pushes that were learnt from."""
-        return self._learnt[thing].num_pushes
+        """Pushes that were learnt from, of this thing or of its kin."""
+        return self._learnt[thing].num_pushes + self._num_told[thing]
 
     def scene(self, thing: int) -> Scene:
         """The thing alone."""
@@ -147,10 +160,34 @@ class LearntRoom(RoomBelief):
         self._learnt[thing] = self._models[thing].update(
             key, self._learnt[thing], rows, is_new=is_new
         )
+        if self._shares:
+            self._tell_kin()
+
+    def _tell_kin(self) -> None:
+        """Hypotheses about things that nobody has touched, drawn anew."""
+        tried = [i for i, one in enumerate(self._learnt) if one.num_pushes > 0]
+        for thing, learnt in enumerate(self._learnt):
+            if learnt.num_pushes > 0:
+                continue
+            odds = kin_odds(
+                self._models[thing].spec,
+                [self._models[i].spec for i in tried],
+                self._num_labels,
+            )
+            # What looks unlike all that was tried is expected to be what it was.
+            if odds.sum() < _LEAST_ODDS:
+                continue
+            others = [self._learnt[i].draws for i in tried]
+            draws = kin_draws(self._rng, self._prior[thing], others, odds)
+            self._learnt[thing] = learnt._replace(draws=draws)
+            self._num_told[thing] += 1
 
     def shares(self, thing: int) -> dict[str, float]:
         """Probability of each kind of thing."""
         model, learnt = self._models[thing], self._learnt[thing]
+        if learnt.num_pushes == 0:
+            weight = np.ones(learnt.draws.density.shape[0])
+            return kind_shares(learnt.draws, model.scene, self._force, weight)
         posterior = model.online.posterior(learnt.belief)
         return kind_shares(
             posterior.params, model.scene, self._force, posterior.weights

@@ -31,7 +31,9 @@ class Grid(NamedTuple):
         axes = [self.low[i] + self.spacing * np.arange(self.shape[i]) for i in range(2)]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
-    def cell(self, place: Float[np.ndarray, "*any 2"]) -> Int[np.ndarray, "*any 2"]:
+    def cell(
+        self, place: Float[np.ndarray, "*any 2"] | tuple[float, float]
+    ) -> Int[np.ndarray, "*any 2"]:
         """The cell that a place lies in, or the nearest one at the rim."""
         index = np.rint((np.asarray(place, float) - self.low) / self.spacing)
         return np.clip(index.astype(int), 0, np.array(self.shape) - 1)
