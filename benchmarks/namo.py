@@ -1,7 +1,7 @@
 """Robots among furniture: who gets to the goal, and how many pushes are wasted.
 
-Random rooms of 2, 4 and 8 things, and the papers' story room, for agents that know, that
-learn, and that do not. A room is solved if the robot's body is at its goal without
+Random rooms of 2, 4 and 8 things, and the papers' story room, for agents that know,
+that learn, and that do not. A room is solved if the robot's body is at its goal with no
 overlap, in the engine. Bands are 95 % (Wilson for shares, normal for means).
 """
 

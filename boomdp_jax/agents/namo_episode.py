@@ -1,6 +1,7 @@
 """One robot in one room, from the start to the goal or to giving up."""
 
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
@@ -48,6 +49,7 @@ _STIR = 0.03
 _NEAR = 0.02
 """How near the robot has to come to its grasp [m]."""
 
+_COMPILER = ThreadPoolExecutor(max_workers=1)
 _grasped = jax.jit(grasped)
 _is_at_goal = jax.jit(is_at_goal)
 
@@ -107,6 +109,12 @@ class _Episode:
         self.seconds: list[float] = []
         self.effort = self.most_force = self.most_overlap = 0.0
         self.num_steps = 0
+        # The world's step takes half a minute to compile; the first plan is made
+        # meanwhile.
+        nothing = pushing(jnp.zeros(3))
+        self._compiled: Future | None = _COMPILER.submit(
+            drive, key, self.world, self.state, nothing
+        )
 
     @property
     def robot(self) -> np.ndarray:
@@ -125,6 +133,9 @@ class _Episode:
 
     def carry_out(self, command: Command) -> Driven:
         """Drive, and keep count."""
+        if self._compiled is not None:
+            self._compiled.result()
+            self._compiled = None
         self.state, driven = drive(self.split(), self.world, self.state, command)
         self.read = jax.tree.map(lambda leaf: leaf[-1], driven.reading.after)
         self.poses.append(np.asarray(driven.place))

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from boomdp_jax.agents.namo_episode import NamoRecord
+from boomdp_jax.agents.namo_episode import NamoRecord, Try
 from boomdp_jax.core.json_file import check_same, read_json, write_json
 from boomdp_jax.core.npz_file import read_npz, write_npz
 from boomdp_jax.envs.namo_room import KINDS
@@ -154,15 +154,7 @@ def arrays_of(record: NamoRecord) -> dict[str, np.ndarray]:
         for name in (*FIELDS, "poses", "decision_seconds", "most_force", "most_overlap")
     }
     tries = record.tries
-    for name in (
-        "thing",
-        "is_test",
-        "num_pushes",
-        "opened",
-        "promised",
-        "begin",
-        "end",
-    ):
+    for name in Try._fields[:-1]:
         numbers[f"try_{name}"] = np.array([getattr(one, name) for one in tries])
     last = [[one.shares[-1][kind] for kind in KINDS] for one in tries]
     numbers["try_shares"] = np.array(last).reshape(len(tries), len(KINDS))
