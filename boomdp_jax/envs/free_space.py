@@ -206,7 +206,7 @@ def _connected(
     base: Bool[np.ndarray, "x y"],
     start: Bool[np.ndarray, "x y"],
     end: Bool[np.ndarray, "x y"],
-) -> Bool[np.ndarray, "x y"]:
+) -> Bool[np.ndarray, "along across"]:
     """Whether the regions are joined, for each place of the thing round a pose.
 
     Places are whole cells apart, so that what the thing closes is the same everywhere
