@@ -276,8 +276,8 @@ def _read(key: Key, state: State, noise: Float[Array, "5"]) -> State:
     twist_noise = jnp.stack([velocity, velocity, spin])
     shape, dtype = state.pose.shape, state.pose.dtype
     return State(
-        state.pose + pose_noise * jax.random.normal(pose_key, shape, dtype),
-        state.twist + twist_noise * jax.random.normal(twist_key, shape, dtype),
+        state.pose + pose_noise[None] * jax.random.normal(pose_key, shape, dtype),
+        state.twist + twist_noise[None] * jax.random.normal(twist_key, shape, dtype),
     )
 
 
