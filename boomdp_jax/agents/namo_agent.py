@@ -18,7 +18,7 @@ pays for itself. How agents differ is in `Character`.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -67,6 +67,7 @@ class Character(NamedTuple):
     moves_things: bool = True
 
 
+@runtime_checkable
 class Believer(Protocol):
     """What an agent believes of things."""
 
