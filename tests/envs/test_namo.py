@@ -86,6 +86,18 @@ def test_force_at_the_wrist_is_what_friction_and_inertia_of_the_thing_ask_for():
 
 
 @pytest.mark.slow
+def test_to_hold_a_thing_however_it_stands_moves_nothing():
+    for side, turn in ((np.pi, 0.5 * np.pi), (0.5 * np.pi, -2.5 * np.pi)):
+        at = (*AT[:2], turn)
+        world, state = holding(side, at=at, outline=(0.3, 0.3), floor=False)
+        after, driven = drive(KEY, world, state, pushing(np.zeros(3)))
+        np.testing.assert_allclose(
+            after.physics.pose, state.physics.pose, rtol=0, atol=1e-9
+        )
+        np.testing.assert_allclose(driven.reading.wrench, 0.0, atol=1e-6)
+
+
+@pytest.mark.slow
 def test_grasp_is_lost_rather_than_bear_more_than_the_grip():
     for kind in ("free", "fixed", "revolute"):
         world, state = holding(kind=kind, friction=0.3, pin=(0.0, 0.0))
