@@ -18,7 +18,7 @@ pays for itself. How agents differ is in `Character`.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -73,6 +73,7 @@ class Character(NamedTuple):
     moves_things: bool = True
 
 
+@runtime_checkable
 class Believer(Protocol):
     """What an agent believes of things."""
 
@@ -243,8 +244,9 @@ class NamoPlanner:
     def _sites(self, poses: np.ndarray, labels: np.ndarray, here: int) -> list[_Site]:
         """Things that alone keep two regions apart, both ways."""
         sizes = np.bincount(labels.reshape(-1))
-        # However small it is, the robot is in it.
-        sizes[here] = max(sizes[here], _LEAST_REGION)
+        # However small they are, the robot is in one of them and has to get to one.
+        for region in (here, labels[tuple(self.goal_cell)]):
+            sizes[region] = max(sizes[region], _LEAST_REGION)
         found = []
         for thing in range(self.room.num_things):
             joined, num = label_regions(self.space.free(poses, without=thing))
@@ -275,8 +277,7 @@ class NamoPlanner:
         thing, num = site.thing, self.room.num_things
         poses = np.asarray(state.pose, float)[:num]
         sites = grasp_sites(self.space, thing, poses[thing])
-        cells = self.space.grid.cell(sites)
-        is_there = labels[cells[:, 0], cells[:, 1]] == site.start
+        cells, is_there = self._cells_of(sites, labels == site.start)
         none = np.zeros(2), np.zeros(2)
         if not is_there.any():
             return None, none, None
@@ -291,7 +292,8 @@ class NamoPlanner:
         # With what is told again and again nothing is worked out anew.
         ground = self._ground(thing, poses, labels, site)
         where = tuple(np.round(poses[thing] / 0.02).astype(int))
-        name = (thing, self.believer.version(thing), where, id(ground), len(places))
+        seen = is_there.tobytes(), site.start == here
+        name = (thing, self.believer.version(thing), where, id(ground), *seen)
         if name not in self._attempts:
             lone = State(state.pose[thing][None], 0.0 * state.twist[thing][None])
             self._attempts[name] = attempt(
@@ -324,6 +326,20 @@ class NamoPlanner:
             test=2.0 * float(seconds[nearest]) + PUSH_SECONDS,
         )
         return trial, (places[grasp], places[nearest]), ground
+
+    def _cells_of(
+        self, places: Float[np.ndarray, "site 2"], region: Bool[np.ndarray, "x y"]
+    ) -> tuple[np.ndarray, Bool[np.ndarray, " site"]]:
+        """Cells of a region nearest to some places, and whether they are at them.
+
+        Places next to a thing are free by less than half a cell.
+        """
+        inside = np.argwhere(region)
+        away = self.space.grid.place(inside)[None] - places[:, None]
+        away = np.linalg.norm(away, axis=-1)
+        near = np.argmin(away, axis=1)
+        least = away[np.arange(len(places)), near]
+        return inside[near], least < self.space.grid.spacing
 
     def _ground(
         self, thing: int, poses: np.ndarray, labels: np.ndarray, site: _Site
@@ -372,7 +388,7 @@ def _hops(edges: Sequence[tuple[int, int]], start: int) -> dict[int, int]:
     """Fewest edges from a region to each other."""
     found, rim = {start: 0}, [start]
     while rim:
+        level = 1 + found[rim[0]]
         rim = sorted({b for a, b in edges if a in rim and b not in found})
-        for region in rim:
-            found[region] = 1 + max(found.values())
+        found |= dict.fromkeys(rim, level)
     return found

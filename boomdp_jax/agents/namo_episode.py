@@ -40,12 +40,14 @@ LONGEST = 150.0
 """Seconds of simulated time after which an episode is over."""
 _MOST_PUSHES = 16
 """Of one attempt."""
-_LEAST_HOPE = 0.1
+_LEAST_HOPE = 0.05
 """Probability below which an attempt is broken off."""
 _STUCK = 3
 """Pushes in a row that move nothing, after which an attempt is broken off."""
 _STIR = 0.03
 """What counts as moving [m]."""
+_MOST_BRAKES, _SLOW = 4, 0.15
+"""Commands to brake with, and the speed at which it lets go [m/s]."""
 _NEAR = 0.02
 """How near the robot has to come to its grasp [m]."""
 
@@ -215,11 +217,20 @@ class _Episode:
             num_still = num_still + 1 if moved < _STIR else 0
             self._learn(trial.thing, driven, is_new=num == 0)
             shares.append(self.belief.shares(trial.thing))
-            if self._is_joined(choice):
+            if self._is_joined(choice) and self._comes_to_rest(choice):
                 return num + 1, True
             if int(self.state.held) == NOBODY:
                 return num + 1, False
         return (1 if choice.is_test else _MOST_PUSHES), False
+
+    def _comes_to_rest(self, choice: Choice) -> bool:
+        """Brake before letting go; whether the way is still open then."""
+        for _ in range(_MOST_BRAKES):
+            twist = np.asarray(self.read.twist, float)[self.room.num_things]
+            if np.hypot(twist[0], twist[1]) < _SLOW or int(self.state.held) == NOBODY:
+                break
+            self.carry_out(going(self.robot[None], self.room.robot.speed))
+        return self._is_joined(choice)
 
     def _learn(self, thing: int, driven: Driven, *, is_new: bool) -> None:
         if not self.character.learns:
@@ -292,7 +303,7 @@ def run_namo(
         opened = episode.attempt(choice)
         if opened:
             avoided.clear()
-        elif not choice.is_test:
+        elif not choice.is_test or not episode.tries[-1].num_pushes:
             count[thing] += 1
             avoided.add(thing)
     return _record(episode, episode.world, episode.state)

@@ -210,7 +210,7 @@ def _connected(
     pose: Float[np.ndarray, "3"],
     base: Bool[np.ndarray, "x y"],
     regions: tuple,
-) -> Bool[np.ndarray, "x y"]:
+) -> Bool[np.ndarray, "along across"]:
     """Whether the regions are joined, for each place of the thing round a pose.
 
     Places are whole cells apart, so that what the thing closes is the same everywhere

@@ -3,17 +3,12 @@ r"""The world of a robot that moves furniture out of its way: one step of it.
 The robot is a disc with a hand at its rim. It drives with a bounded wrench, pushes what
 it touches (the engine's contacts), and may hold a thing: the grasp is a weld of the
 engine between thing and robot, made where both are, so that it transmits force and
-torque. What it transmits follows from the robot's momentum balance,
-
-$$f = m_r \Delta v / \Delta t - f_{drive} - f_{contact},$$
-
-and is what a sensor at the wrist reads. A step in which that force would exceed the
-grip's limit is taken without the grasp, which is lost: it is never stronger than it is
-said to be.
+torque. What it transmits, by the robot's momentum (`weld_grasp`), is what a sensor at
+the wrist reads, and is never more than the grip's limit: a grasp that would have to
+bear more is lost.
 """
 
 import dataclasses
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -21,12 +16,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar, Key, on_device
-from boomdp_jax.envs.namo_room import NUM_SUBSTEPS, Room, room_params, room_scene
+from boomdp_jax.envs.namo_room import (
+    NUM_SUBSTEPS,
+    Room,
+    check_room,
+    room_params,
+    room_scene,
+)
+from boomdp_jax.envs.weld_grasp import Holder, with_grasp, yielding_step
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.separation import separation
 from boomdp_jax.physics.state import State
-from boomdp_jax.physics.step import step
 
 NOBODY = -1
 """Held by the robot."""
@@ -66,8 +67,8 @@ class NamoState(eqx.Module):
     angle: FloatScalar
     """Of the thing against the robot [rad]."""
     past: State
-    """Readings that are still under way, latest first; leading axis `delay`, of length
-    zero where there is none."""
+    """Readings that are still under way, latest first; leading axis one more than the
+    delay, or of length zero where there is none."""
 
 
 class NamoReading(eqx.Module):
@@ -106,8 +107,11 @@ def make_world(
 
     Returns:
         World and first state, without a delay (see `with_delay`).
+
+    Raises:
+        ValueError: what is no room (`check_room`).
     """
-    spec = room_scene(room)
+    spec = room_scene(check_room(room))
     robot = room.robot
     state = spec.initial_state()
     zero = on_device(0.0)
@@ -142,8 +146,9 @@ def with_delay(state: NamoState, delay: int) -> NamoState:
     """
     if delay < 0:
         raise ValueError(f"delay: expected at least 0 steps, got {delay}")
+    num = delay + 1 if delay > 0 else 0
     past = jax.tree.map(
-        lambda leaf: jnp.broadcast_to(leaf, (delay, *leaf.shape)), state.physics
+        lambda leaf: jnp.broadcast_to(leaf, (num, *leaf.shape)), state.physics
     )
     return dataclasses.replace(state, past=past)
 
@@ -196,23 +201,12 @@ def namo_step(
     drive = jnp.concatenate([force, torque[None]])
     wrench = jnp.zeros_like(bodies.pose).at[robot].set(drive)
 
-    def take(carry):
-        """A step; what slips in it is taken again without the grasp."""
-        _, holds, _, _, _ = carry
-        physics = _with_grasp(world.physics, state, robot, holds)
-        after, info = step(world.scene, physics, bodies, wrench)
-        contact: Any = info.contact_wrench
-        given = _transmitted(world, bodies, after, drive, contact)
-        slips = holds & (jnp.sum(given[:2] ** 2) > world.grip**2)
-        given = jnp.where(holds & ~slips, given, 0.0)
-        return slips, holds & ~slips, after, given, info.overlap
-
-    zero = jnp.zeros((), bodies.pose.dtype)
-    begun = jnp.ones((), bool), state.held >= 0, bodies, jnp.zeros(3, zero.dtype), zero
-    # A loop, so that the engine's step is compiled once.
-    taken = jax.lax.while_loop(lambda carry: carry[0], take, begun)
-    _, stays, after, given, overlap = taken
-    slips = (state.held >= 0) & ~stays
+    hand = Holder(robot[None], lambda poses: poses[0, :2])
+    limit = jnp.stack([world.grip, jnp.full_like(world.grip, jnp.inf)])
+    held = _with_grasp(world.physics, state, robot)
+    taken = yielding_step(hand, world.scene, held, bodies, wrench, limit)
+    after, given = taken.after, -taken.reaction
+    stays = (state.held >= 0) & ~taken.has_slipped
     size = jnp.sqrt(jnp.sum(given[:2] ** 2))
     body = jnp.maximum(state.held, 0)
     # About the middle of the thing, as it was half-way.
@@ -235,9 +229,11 @@ def namo_step(
     following = dataclasses.replace(
         state, physics=after, held=jnp.where(stays, state.held, NOBODY)
     )
+    overlap = taken.info.overlap
+    assert overlap is not None
     happened = NamoInfo(
-        has_slipped=slips,
-        force=jnp.where(stays, size, 0.0),
+        has_slipped=taken.has_slipped,
+        force=size,
         overlap=overlap,
     )
     return *_delayed(following, reading), happened
@@ -260,38 +256,17 @@ def is_at_goal(world: NamoWorld, state: NamoState) -> BoolScalar:
     return (away < GOAL_RADIUS) & (gap > -2e-3)
 
 
-def _with_grasp(
-    physics: Params, state: NamoState, robot: IntScalar, holds: BoolScalar
-) -> Params:
-    """The weld ties the thing to the robot, if it is held."""
-    weld = physics.weld
-    assert weld is not None
-    body = jnp.maximum(state.held, 0).astype(weld.body_a.dtype)
-    grasp = {
-        "active": holds,
-        "body_a": body,
-        "body_b": robot.astype(weld.body_b.dtype),
-        "anchor_a": state.anchor,
-        "anchor_b": jnp.zeros(2),
-        "angle": state.angle,
-    }
-    changed = {
-        key: getattr(weld, key).at[0].set(value.astype(getattr(weld, key).dtype))
-        for key, value in grasp.items()
-    }
-    return dataclasses.replace(physics, weld=type(weld)(**changed))
-
-
-def _transmitted(
-    world: NamoWorld, before: State, after: State, drive: Array, contact: Array
-) -> Float[Array, "3"]:
-    """What the hand does to what it holds, by the robot's momentum balance."""
-    robot, scene = world.robot, world.scene
-    mass = world.physics.density[robot] * scene.area[robot]
-    inertia = mass * scene.gyration[robot]
-    change = (after.twist[robot] - before.twist[robot]) / scene.dt
-    gained = change * jnp.stack([mass, mass, inertia])
-    return drive + contact[robot] - gained
+def _with_grasp(physics: Params, state: NamoState, robot: IntScalar) -> Params:
+    """The weld ties the robot to the thing, if one is held."""
+    return with_grasp(
+        physics,
+        state.held >= 0,
+        hand=robot,
+        held=jnp.maximum(state.held, 0),
+        on_hand=jnp.zeros_like(state.anchor),
+        on_held=state.anchor,
+        angle=-state.angle,
+    )
 
 
 def _read(key: Key, state: State, noise: Float[Array, "5"]) -> State:
@@ -301,15 +276,15 @@ def _read(key: Key, state: State, noise: Float[Array, "5"]) -> State:
     twist_noise = jnp.stack([velocity, velocity, spin])
     shape, dtype = state.pose.shape, state.pose.dtype
     return State(
-        state.pose + pose_noise * jax.random.normal(pose_key, shape, dtype),
-        state.twist + twist_noise * jax.random.normal(twist_key, shape, dtype),
+        state.pose + pose_noise[None] * jax.random.normal(pose_key, shape, dtype),
+        state.twist + twist_noise[None] * jax.random.normal(twist_key, shape, dtype),
     )
 
 
 def _delayed(state: NamoState, reading: NamoReading) -> tuple[NamoState, NamoReading]:
     """Poses and twists as they were some steps ago; the wrist's sensor is at once."""
-    delay = state.past.pose.shape[0]
-    if delay == 0:
+    num = state.past.pose.shape[0]
+    if num == 0:
         return state, reading
     line = jax.tree.map(
         lambda new, old: jnp.concatenate([new[None], old]), reading.after, state.past
@@ -319,5 +294,5 @@ def _delayed(state: NamoState, reading: NamoReading) -> tuple[NamoState, NamoRea
         before=jax.tree.map(lambda leaf: leaf[-1], state.past),
         after=jax.tree.map(lambda leaf: leaf[-2], line),
     )
-    past = jax.tree.map(lambda leaf: leaf[:delay], line)
+    past = jax.tree.map(lambda leaf: leaf[:num], line)
     return dataclasses.replace(state, past=past), late

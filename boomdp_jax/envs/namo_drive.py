@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from boomdp_jax.core.arrays import BoolScalar, FloatScalar, Key
+from boomdp_jax.core.arrays import BoolScalar, FloatScalar, Key, on_device
 from boomdp_jax.envs.namo import NamoReading, NamoState, NamoWorld, namo_step
 
 NUM_STEPS = 4
@@ -52,13 +52,13 @@ class Driven(NamedTuple):
     """Deepest [m]."""
 
 
-def pushing(wrench: Float[Array, "3"]) -> Command:
+def pushing(wrench: Float[Array | np.ndarray, "3"]) -> Command:
     """Drive with one wrench."""
     return Command(
-        jnp.ones((), bool),
-        jnp.asarray(wrench, float),
-        jnp.zeros((MOST_POINTS, 2)),
-        jnp.zeros(()),
+        is_push=on_device(True, bool),
+        push=on_device(wrench),
+        way=on_device(np.zeros((MOST_POINTS, 2))),
+        speed=on_device(0.0),
     )
 
 
@@ -77,8 +77,12 @@ def going(way: Float[np.ndarray, "point 2"], speed: float) -> Command:
         raise ValueError("way: expected one point at least, got none")
     way = way[:MOST_POINTS]
     padded = np.concatenate([way, np.repeat(way[-1:], MOST_POINTS - len(way), axis=0)])
+    # Of the same types as pushes, so that there is one program.
     return Command(
-        jnp.zeros((), bool), jnp.zeros(3), jnp.asarray(padded), jnp.asarray(speed)
+        is_push=on_device(False, bool),
+        push=on_device(np.zeros(3)),
+        way=on_device(padded),
+        speed=on_device(speed),
     )
 
 
@@ -126,7 +130,7 @@ def _towards(world: NamoWorld, state: NamoState, command: Command) -> Float[Arra
     robot, scene = world.robot, world.scene
     pose, twist = state.physics.pose[robot], state.physics.twist[robot]
     way = command.way.astype(pose.dtype)
-    away = jnp.sqrt(jnp.sum((way - pose[:2]) ** 2, axis=-1))
+    away = jnp.sqrt(jnp.sum((way - pose[None, :2]) ** 2, axis=-1))
     nearest = jnp.argmin(away)
     # As far on as is within reach without losing the way.
     index: Int[Array, " point"] = jnp.arange(way.shape[0])

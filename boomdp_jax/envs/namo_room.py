@@ -159,8 +159,8 @@ def check_room(room: Room) -> Room:
         The same.
 
     Raises:
-        ValueError: which thing or wall, which field, what was expected and what is
-            there.
+        ValueError: which thing or wall or part of the robot, which field, what was
+            expected and what is there.
     """
     if len(room.walls) < 4:
         raise ValueError(
@@ -183,12 +183,23 @@ def check_room(room: Room) -> Room:
                 f"{where}: label: expected one of {', '.join(LOOKS)}; got "
                 f"{thing.label!r}"
             )
+        sizes = thing.outline
+        if len(sizes) not in (1, 2) or not all(0 < size < math.inf for size in sizes):
+            raise ValueError(
+                f"{where}: outline: expected a radius or two half extents, positive, "
+                f"got {sizes}"
+            )
         for field in ("density", "friction"):
             if not 0 < getattr(thing, field) < math.inf:
                 raise ValueError(
                     f"{where}: {field}: expected a positive number, got "
                     f"{getattr(thing, field)}"
                 )
+    for field, number in room.robot._asdict().items():
+        if not 0 < number < math.inf:
+            raise ValueError(
+                f"robot: {field}: expected a positive number, got {number}"
+            )
     names = [thing.name for thing in room.things]
     for name in (*names, ROBOT):
         if [*names, ROBOT].count(name) > 1:

@@ -33,7 +33,7 @@ def packed(cells: Bool[np.ndarray, "*map column cell"]) -> Words:
     return np.asarray(np.sum(bits, axis=-1, dtype=np.uint64))
 
 
-def reached(free: Words, seed: Words) -> Words:
+def reached(free: Words, seed: UInt64[np.ndarray, "*seed column"]) -> Words:
     """Cells that are connected, side by side, with a seed.
 
     Args:

@@ -13,7 +13,7 @@ work is linear in the number of things but for that.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 
@@ -47,6 +47,15 @@ class Order(NamedTuple):
     """In the order in which they are tried, one a thing."""
 
 
+class _Ranked(NamedTuple):
+    """A trial with what it leads to."""
+
+    index: float
+    success: float
+    """Cost, what follows included."""
+    trial: Trial
+
+
 def index_of(trial: Trial, value_after: float) -> float:
     """By which trials are sorted; infinite for what cannot work."""
     if trial.probability <= 0.0:
@@ -60,32 +69,38 @@ def best_order(
 ) -> Order:
     """The best order in which to try things from one region.
 
+    With one trial a thing no order of any of them is cheaper. A thing with several
+    trials is tried in one way only: the likelier one is not always that of the least
+    index, so ways are exchanged until no exchange at one thing is cheaper.
+
     Args:
-        trials: all from that region; of several with one thing the best is taken.
+        trials: all from that region.
         values: expected cost from each region on; of one that is missing: giving up.
         give_up: cost of not getting there.
 
     Returns:
         The order, without what is not worth a trial.
     """
-    best: dict[int, tuple[float, Trial]] = {}
+    ways: dict[int, list[_Ranked]] = {}
     for trial in trials:
-        index = index_of(trial, values.get(trial.end, give_up))
-        if index < best.get(trial.thing, (math.inf, None))[0]:
-            best[trial.thing] = index, trial
-    # Whoever pays more than giving up costs does not try; the index is what a trial
-    # that is repeated with new things until one works costs.
-    ranked = sorted(
-        (item for item in best.values() if item[0] < give_up), key=lambda item: item[0]
-    )
-    order = tuple(trial for _, trial in ranked)
-    value = give_up
-    for trial in reversed(order):
-        success = trial.cost + values.get(trial.end, give_up)
-        value = trial.probability * success + (1.0 - trial.probability) * (
-            trial.loss + value
-        )
-    return Order(value, order)
+        after = values.get(trial.end, give_up)
+        index = index_of(trial, after)
+        # Before others whose value is V a trial pays if its index is below V, and V is
+        # never above that of giving up.
+        if index < give_up:
+            found = _Ranked(index, trial.cost + after, trial)
+            ways.setdefault(trial.thing, []).append(found)
+    chosen = {thing: min(own, key=lambda way: way.index) for thing, own in ways.items()}
+    value, is_settled = _value(chosen.values(), give_up), False
+    while not is_settled:
+        is_settled = True
+        for thing, own in ways.items():
+            for way in own:
+                changed = {**chosen, thing: way}
+                other = _value(changed.values(), give_up)
+                if other < value:
+                    chosen, value, is_settled = changed, other, False
+    return Order(value, tuple(one.trial for one in _sorted(chosen.values())))
 
 
 def region_values(
@@ -145,3 +160,16 @@ def worth_of_test(
     now = best_order(trials, values, give_up).value
     p = trial.probability
     return now - (trial.test + p * known(True) + (1.0 - p) * known(False))
+
+
+def _sorted(ranked: Iterable[_Ranked]) -> list[_Ranked]:
+    return sorted(ranked, key=lambda one: one.index)
+
+
+def _value(ranked: Iterable[_Ranked], give_up: float) -> float:
+    """Expected cost of trying all of them in the best order."""
+    value = give_up
+    for _, success, trial in reversed(_sorted(ranked)):
+        failure = trial.loss + value
+        value = trial.probability * success + (1.0 - trial.probability) * failure
+    return value
