@@ -32,7 +32,8 @@ from boomdp_jax.agents.manipulation import (
     ground_of,
 )
 from boomdp_jax.core.arrays import Key
-from boomdp_jax.envs.free_space import FreeSpace, pose_table
+from boomdp_jax.envs.free_space import FreeSpace, distance_to, pose_table
+from boomdp_jax.envs.namo import REACH
 from boomdp_jax.envs.namo_room import Room
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
@@ -170,6 +171,11 @@ class NamoPlanner:
         poses = np.asarray(state.pose, float)[:num]
         labels, free = self.labels(poses)
         here, cell = self.region_at(labels, robot)
+        if here == 0:
+            # It is wedged in; where it stands is a region by itself.
+            cell, here = self.space.grid.cell(robot), int(labels.max()) + 1
+            labels, free = labels.copy(), free.copy()
+            labels[tuple(cell)], free[tuple(cell)] = here, True
         # Where a thing stands on the goal, that is a region by itself.
         goal = int(labels[tuple(self.goal_cell)]) or COVERED
         ways = ways_from(self.space.grid, free, cell)
@@ -182,7 +188,9 @@ class NamoPlanner:
         for site in _on_the_way(self._sites(poses, labels, here), here, goal):
             if site.thing in avoided:
                 continue
-            trial, place, ground = self._trial(key, state, labels, ways, here, site)
+            trial, place, ground = self._trial(
+                key, state, labels, ways, here, site, np.asarray(robot, float)
+            )
             if trial is not None:
                 found.append(trial)
                 places[trial], grounds[trial] = place, ground
@@ -272,12 +280,20 @@ class NamoPlanner:
         ways: Ways,
         here: int,
         site: _Site,
+        robot: np.ndarray,
     ) -> tuple[Trial | None, tuple[np.ndarray, np.ndarray], Ground | None]:
         """What a thing promises between two regions; its best and nearest grasp."""
         thing, num = site.thing, self.room.num_things
         poses = np.asarray(state.pose, float)[:num]
         sites = grasp_sites(self.space, thing, poses[thing])
-        cells, is_there = self._cells_of(sites, labels == site.start)
+        cells, is_there = self.cells_of(sites, labels == site.start)
+        outline = self.room.things[thing].outline
+        gap = distance_to(robot, outline, poses[thing]) - self.room.robot.radius
+        if site.start == here and 0.0 < gap < REACH:
+            # It may hold the thing where it stands.
+            sites = np.concatenate([sites, robot[None]])
+            cells = np.concatenate([cells, [ways.start]])
+            is_there = np.append(is_there, True)
         none = np.zeros(2), np.zeros(2)
         if not is_there.any():
             return None, none, None
@@ -327,7 +343,7 @@ class NamoPlanner:
         )
         return trial, (places[grasp], places[nearest]), ground
 
-    def _cells_of(
+    def cells_of(
         self, places: Float[np.ndarray, "site 2"], region: Bool[np.ndarray, "x y"]
     ) -> tuple[np.ndarray, Bool[np.ndarray, " site"]]:
         """Cells of a region nearest to some places, and whether they are at them.

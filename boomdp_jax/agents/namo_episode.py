@@ -172,11 +172,14 @@ class _Episode:
         trial = choice.trial
         assert trial is not None
         begin, shares = self.num_steps, [self.belief.shares(trial.thing)]
-        cell = self.planner.space.grid.cell(choice.place)
-        way = choice.ways.path_to(cell)
+        region = choice.labels == trial.start
+        cells, _ = self.planner.cells_of(choice.place[None], region)
+        is_here = np.linalg.norm(choice.place - self.robot) < _NEAR
+        way = choice.ways.path_to(choice.ways.start if is_here else cells[0])
         num_pushes, opened = 0, False
         if way is not None:
-            self.go(np.concatenate([way, choice.place[None]]), _NEAR)
+            if not is_here:
+                self.go(np.concatenate([way, choice.place[None]]), _NEAR)
             self.state = _grasped(self.world, self.state, trial.thing)
             if int(self.state.held) != NOBODY:
                 num_pushes, opened = self._push_on(choice, shares)

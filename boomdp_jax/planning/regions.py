@@ -87,6 +87,8 @@ class Ways(NamedTuple):
     grid: Grid
     length: Float[np.ndarray, "x y"]
     """Of the way to each cell [m]; infinite where there is none."""
+    start: Int[np.ndarray, "2"]
+    """Cell at which ways begin."""
     before: Int[np.ndarray, "cell"]
     """On that way, the flat index of the cell before; negative where there is none."""
 
@@ -139,7 +141,7 @@ def ways_from(
         indices=int(index[tuple(start)]),
         return_predecessors=True,
     )
-    return Ways(grid, length.reshape(free.shape), before)
+    return Ways(grid, length.reshape(free.shape), np.asarray(start), before)
 
 
 def _neighbours(free: np.ndarray, step: np.ndarray) -> tuple[tuple, tuple]:
