@@ -2,8 +2,8 @@
 
 The points of a chunk share an object and a structure, so that what belongs to those is
 read once for a chunk and products with it vectorise. A call of a compiled program takes
-up to `MAX_CHUNKS` chunks of up to `MAX_OWNERS` objects and structures, and does as much
-work as there are: the number of chunks is not compiled in.
+up to `max_chunks()` chunks of up to `MAX_OWNERS` objects and structures, and does as
+much work as there are: the number of chunks is not compiled in.
 """
 
 from collections.abc import Callable, Iterator
@@ -14,14 +14,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-MAX_CHUNKS = 32
-"""Of one call."""
-
 CHUNK_SIZE = 64
 """Points of a chunk."""
 
 MAX_OWNERS = 8
 """Pairs of object and structure in one call."""
+
+
+def max_chunks() -> int:
+    """Chunks of one call.
+
+    On a CPU one chunk is worked at after the other, and results take memory for all of
+    them, which costs more than a call once rows are some hundred. Others need many.
+    """
+    return 8 if jax.default_backend() == "cpu" else 32
 
 
 class Call(NamedTuple):
@@ -88,7 +94,8 @@ class Chunking(NamedTuple):
                 if there are chunks enough.
         """
         total = len(self.owner)
-        most = min(MAX_CHUNKS, max(-(-total // num_workers), 1))
+        num_places = max_chunks()
+        most = min(num_places, max(-(-total // num_workers), 1))
         is_new = np.ones(total, bool)
         is_new[1:] = np.any(self.owner[1:] != self.owner[:-1], axis=1)
         number = np.cumsum(is_new) - 1
@@ -101,8 +108,8 @@ class Chunking(NamedTuple):
             first = begin + np.flatnonzero(np.diff(within, prepend=-1))
             owners = np.resize(self.owner[first], (MAX_OWNERS, 2))
             owners[len(first) :] = self.owner[begin]
-            chunk = np.minimum(begin + np.arange(MAX_CHUNKS), begin + num - 1)
-            owner = np.zeros(MAX_CHUNKS, np.int32)
+            chunk = np.minimum(begin + np.arange(num_places), begin + num - 1)
+            owner = np.zeros(num_places, np.int32)
             owner[:num] = within
             count = np.array(num, np.int32)
             yield Call(owners.astype(np.int32), owner, count, self.source[chunk])

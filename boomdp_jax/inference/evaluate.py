@@ -17,10 +17,10 @@ from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.core.spread import Program, num_at_a_time, run_each
 from boomdp_jax.inference.chunking import (
     CHUNK_SIZE,
-    MAX_CHUNKS,
     MAX_OWNERS,
     Chunking,
     for_each_chunk,
+    max_chunks,
 )
 from boomdp_jax.inference.filtered_likelihood import without_gains
 from boomdp_jax.inference.target import StructureTarget
@@ -66,9 +66,10 @@ def _evaluate_chunks(known: _Known, owner, num, z):
     def one_chunk(known: _Known, z):
         likelihood, gains, reference, active = known
         log_volume = likelihood.log_volume(gains)
+        is_used = likelihood.data.is_used
 
         def one_point(z):
-            found = likelihood.innovations(z, active, gains)
+            found = likelihood.innovations(z, active, gains, is_used)
             value = likelihood.log_marginal(found.statistics, log_volume, reference)
             return value, found.statistics, found.whitened.reshape(-1)
 
@@ -179,7 +180,7 @@ def pushed_innovations(
     num_lists, num_points, _ = z.shape
     # Shapes of the calls are those of `evaluate_points`, each list a chunk.
     points = np.minimum(np.arange(CHUNK_SIZE), num_points - 1)
-    owner = np.minimum(np.arange(MAX_CHUNKS), MAX_OWNERS - 1).astype(np.int32)
+    owner = np.minimum(np.arange(max_chunks()), MAX_OWNERS - 1).astype(np.int32)
     dtype = targets.log_prior.dtype
     inputs, counts = [], []
     for begin in range(0, num_lists, MAX_OWNERS):

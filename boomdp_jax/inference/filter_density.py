@@ -8,6 +8,7 @@ methods for discrete sequential estimation).
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 from boomdp_jax.core.arrays import FloatScalar
 from boomdp_jax.inference.contact_prediction import ContactScene
@@ -35,6 +36,7 @@ from boomdp_jax.inference.tracking import (
     predictor,
     split_channels,
 )
+from boomdp_jax.inference.used_rows import scan_used
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 
@@ -44,6 +46,7 @@ def filter_density(
     params: Params,
     data: TrackData,
     noise: NoiseLevel,
+    is_used: Bool[Array, " time"] | None = None,
 ) -> FloatScalar:
     """Log-density of all readings but the first of each track.
 
@@ -52,13 +55,14 @@ def filter_density(
         params: the hypothesis.
         data: the block's readings.
         noise: of readings and motion.
+        is_used: as `scan_used` has it.
 
     Returns:
         The same as `extended_filter` gives. To be batched by `jax.vmap`.
     """
     data = with_delay(params, data)
     if isinstance(scene, Scene) and data.freedom is None and scene.num_bodies == 1:
-        return _density_of_one_body(scene, params, data, noise)
+        return _density_of_one_body(scene, params, data, noise, is_used)
     steps = data.steps
     predict = cloud_predictor(scene, params, steps.dt)
     num_bodies = steps.state.shape[1]
@@ -101,11 +105,15 @@ def filter_density(
         return (state, covariance, total + density), None
 
     carry = (jnp.zeros((num_bodies, 6)), jnp.eye(num), jnp.zeros(()))
-    return jax.lax.scan(advance, carry, data.rows)[0][2]
+    return scan_used(advance, carry, data.rows, is_used)[0][2]
 
 
 def _density_of_one_body(
-    scene: Scene, params: Params, data: TrackData, noise: NoiseLevel
+    scene: Scene,
+    params: Params,
+    data: TrackData,
+    noise: NoiseLevel,
+    is_used: Bool[Array, " time"] | None,
 ) -> FloatScalar:
     """The same channel by channel, each a vector in a batch of points."""
     predict = _cloud_of_channels(predictor(scene, params, data.steps.dt), data.rows)
@@ -152,7 +160,7 @@ def _density_of_one_body(
     zero, one = jnp.zeros(()), jnp.ones(())
     lower = [[one if i == j else zero for j in range(i + 1)] for i in num]
     carry = ([zero for _ in num], lower, zero)
-    return jax.lax.scan(advance, carry, data.rows)[0][2]
+    return scan_used(advance, carry, data.rows, is_used)[0][2]
 
 
 def _cloud_of_channels(predict: Predict, rows: TrackRow):

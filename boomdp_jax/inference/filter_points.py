@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from boomdp_jax.core.spread import Program, num_at_a_time, run_each
@@ -31,10 +32,11 @@ def _densities_of_chunks(known, owner, num, points):
 
     def one_chunk(known, points):
         coordinates, data = known
+        is_used = data.is_used
 
         def one_point(active, z, noise):
-            params = coordinates(z, active)
-            return filter_density(coordinates.world, params, data, NoiseLevel(*noise))
+            params, level = coordinates(z, active), NoiseLevel(*noise)
+            return filter_density(coordinates.world, params, data, level, is_used)
 
         return jax.vmap(one_point)(*points)
 
@@ -99,10 +101,12 @@ def _gather_points(targets: StructureTarget, index, structure, z, noise) -> tupl
 
 
 def _filter_each(known, active, z, noise) -> Filtered:
+    is_used = jnp.any(known[1].is_used, axis=0)
+
     def one(known, active, z, noise):
         coordinates, data = known
-        params = coordinates(z, active)
-        return extended_filter(coordinates.world, params, data, NoiseLevel(*noise))
+        params, level = coordinates(z, active), NoiseLevel(*noise)
+        return extended_filter(coordinates.world, params, data, level, is_used)
 
     return jax.vmap(one)(known, active, z, noise)
 

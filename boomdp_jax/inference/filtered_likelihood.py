@@ -40,9 +40,12 @@ class FilteredLikelihood(eqx.Module):
     data: TrackData
     structures: Bool[Array, "structure slot"] | None
     gains: Gains | None
-    """With a leading structure axis."""
-    reference: Float[Array, "structure body 4"] | None
+    """With a leading structure axis; in an online belief with as many levels of noise
+    for each structure, level by level (`noise_levels`)."""
+    reference: Float[Array, "level body 4"] | None
     """Noise that the gains were made for."""
+    offset: Float[Array, " level"] | None = None
+    """What is added to the log-likelihood by these gains; None: nothing."""
 
     def __call__(
         self, z: Float[Array, " dim"], active: Bool[Array, " slot"]
@@ -66,11 +69,15 @@ class FilteredLikelihood(eqx.Module):
         return jax.tree.map(lambda leaf: leaf[structure], self.gains)
 
     def innovations(
-        self, z: Float[Array, " dim"], active: Bool[Array, " slot"], gains: Gains
+        self,
+        z: Float[Array, " dim"],
+        active: Bool[Array, " slot"],
+        gains: Gains,
+        is_used: Bool[Array, " time"] | None = None,
     ) -> Innovations:
         """Whitened innovations at a hypothesis, and their sums of squares."""
-        params = self.coordinates(z, active)
-        whitened = innovations(self.coordinates.world, params, self.data, gains)
+        params, data = self.coordinates(z, active), self.data
+        whitened = innovations(self.coordinates.world, params, data, gains, is_used)
         weight = self.data.weight
         if weight is not None:
             whitened = whitened * jnp.sqrt(weight)[:, None, None, None]

@@ -22,13 +22,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import FloatScalar
 from boomdp_jax.inference.contact_prediction import ContactScene
 from boomdp_jax.inference.robust_update import correct_robustly
 from boomdp_jax.inference.track_data import TrackData, TrackRow, with_delay
 from boomdp_jax.inference.tracking import Gains, channel_difference, cloud_predictor
+from boomdp_jax.inference.used_rows import scan_used
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 
@@ -193,6 +194,7 @@ def extended_filter(
     params: Params,
     data: TrackData,
     noise: NoiseLevel,
+    is_used: Bool[Array, " time"] | None = None,
 ) -> Filtered:
     """Filter all rows at one hypothesis.
 
@@ -201,6 +203,7 @@ def extended_filter(
         params: the hypothesis.
         data: the block's readings.
         noise: of readings and motion.
+        is_used: as `scan_used` has it.
 
     Returns:
         Gains, and the log-density of all readings but the first of each track, each
@@ -217,5 +220,5 @@ def extended_filter(
         return (estimate, total + density), (found.gains, found.start, estimate)
 
     carry = (row_filter.start(), jnp.zeros(()))
-    (_, total), (gains, starts, after) = jax.lax.scan(advance, carry, data.rows)
+    (_, total), (gains, starts, after) = scan_used(advance, carry, data.rows, is_used)
     return Filtered(gains, total, starts, after)

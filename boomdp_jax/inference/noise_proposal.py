@@ -22,13 +22,15 @@ from boomdp_jax.inference.target import StructureTarget
 # peak, and the share of each.
 _FREEDOM = 5.0
 _WIDTHS, _SHARES = np.array([1.1, 2.5]), np.array([0.75, 0.25])
-_NUM_ITERATIONS = 8
+_NUM_ITERATIONS, _FEW_ITERATIONS = 8, 3
 # Readings' noise of a start where the motion's takes over, by the peak's.
 _LEFT_TO_READINGS = 0.2
 # Rounds of weighing, draws of each, and share of the component that they fit. Its
 # spread is a little widened, and above this share of the narrow component's variance.
 _NUM_ROUNDS, _NUM_DRAWS, _FITTED_SHARE = 3, 256, 0.6
 _WIDER, _LEAST_SPREAD = 1.3, 0.3
+# Of a fit that begins near a peak.
+_FEW_ROUNDS, _FEW_DRAWS = 2, 128
 # Least share of a peak, and distance at which two are one, in logarithms.
 _LEAST_SHARE, _SAME = 0.1, 0.5
 
@@ -55,6 +57,8 @@ class NoiseProposal(NamedTuple):
         draws: Fits,
         group: np.ndarray,
         start: NoiseFit,
+        *,
+        is_near: bool = False,
     ) -> "NoiseProposal":
         """Fit the noise at the best draw of every group.
 
@@ -64,27 +68,33 @@ class NoiseProposal(NamedTuple):
             draws: with their log-densities.
             group: of each draw.
             start: of each group.
+            is_near: whether the start is known to be near a peak, from which the
+                others are then looked for at once and not for long.
         """
         num_groups = len(start.reading)
         order = np.lexsort((-draws.value, group))
         best = draws.take(order[np.searchsorted(group[order], np.arange(num_groups))])
-        first = fit_noise(targets, best, start, _NUM_ITERATIONS)
-        starts = _other_starts(first.noise.vector)
-        rows = np.tile(np.arange(num_groups), len(starts))
-        others = fit_noise(
-            targets,
-            best.take(rows),
-            NoiseFit.of_vector(starts.reshape(len(rows), -1)),
-            _NUM_ITERATIONS,
-        )
+        if is_near:
+            first, others = _few_peaks(targets, best, start)
+        else:
+            first = fit_noise(targets, best, start, _NUM_ITERATIONS)
+            starts = _other_starts(first.noise.vector)
+            rows = np.tile(np.arange(num_groups), len(starts))
+            others = fit_noise(
+                targets,
+                best.take(rows),
+                NoiseFit.of_vector(starts.reshape(len(rows), -1)),
+                _NUM_ITERATIONS,
+            )
         proposal = peaks = cls.of_peaks(first, others)
         density = NoiseDensity(targets, best)
         names = np.arange(num_groups)
-        for _ in range(_NUM_ROUNDS):
-            each = np.repeat(names, _NUM_DRAWS)
+        num = _FEW_DRAWS if is_near else _NUM_DRAWS
+        for _ in range(_FEW_ROUNDS if is_near else _NUM_ROUNDS):
+            each = np.repeat(names, num)
             vector = proposal.sample(rng, each)
             log_weight = -proposal.log_density(vector, each)
-            vector = vector.reshape(num_groups, _NUM_DRAWS, -1)
+            vector = vector.reshape(num_groups, num, -1)
             log_weight = log_weight.reshape(num_groups, -1) + density(names, vector)
             proposal = peaks.with_fitted(vector, log_weight)
         return proposal
@@ -186,6 +196,23 @@ class NoiseProposal(NamedTuple):
         constant -= 0.5 * size * math.log(_FREEDOM * math.pi)
         each = volume[group] + constant - half * np.log1p(square / _FREEDOM)
         return np.logaddexp.reduce(each + self.log_share[group], axis=1)
+
+
+def _few_peaks(
+    targets: StructureTarget, best: Fits, start: NoiseFit
+) -> tuple[NoisePeaks, NoisePeaks]:
+    """Peaks from starts and from the others about them, all at the same time."""
+    num = len(start.reading)
+    vector = np.concatenate([start.vector[None], _other_starts(start.vector)])
+    rows = np.tile(np.arange(num), len(vector))
+    starts = NoiseFit.of_vector(vector.reshape(len(rows), -1))
+    found = fit_noise(targets, best.take(rows), starts, _FEW_ITERATIONS)
+
+    def part(rows: slice) -> NoisePeaks:
+        noise = NoiseFit(*(leaf[rows] for leaf in found.noise))
+        return NoisePeaks(noise, found.precision[rows], found.log_density[rows])
+
+    return part(slice(0, num)), part(slice(num, None))
 
 
 def _other_starts(vector: np.ndarray) -> np.ndarray:

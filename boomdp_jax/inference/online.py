@@ -3,8 +3,10 @@ r"""A belief that takes one transition at a time: particles over structures and 
 `step` is one compiled function over a table of fixed capacity (`online_step`): every
 particle's filter takes the new readings in, weights change, and where few particles are
 left in effect they are resampled and moved. It never recompiles and needs no more time
-the longer the history is. `refit`, which takes seconds, fits the scene anew
-(`online_refit`); `observe` is a step, and a refit when the belief asks for one.
+the longer the history is. `refit` fits the scene anew (`online_refit`), mostly from
+where the last fit was, which takes some tenths of a second for one body; now and then
+everywhere, which takes one or two seconds. `observe` is a step, and a refit when the
+belief asks for one.
 
 Prefer `infer` where all data are there; this where they come one by one and something
 has to be decided in between. Chopin (2002), A sequential particle filter method for
@@ -28,6 +30,7 @@ from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.compile_ahead import signature
 from boomdp_jax.inference.components import independent_blocks
 from boomdp_jax.inference.infer import check_history
+from boomdp_jax.inference.online_fit import RefitSettings, make_online_block
 from boomdp_jax.inference.online_posterior import (
     best_params,
     online_params,
@@ -36,8 +39,6 @@ from boomdp_jax.inference.online_posterior import (
 )
 from boomdp_jax.inference.online_refit import (
     RefitInfo,
-    RefitSettings,
-    make_online_block,
     prior_belief,
     refit_block,
 )
@@ -280,7 +281,7 @@ class OnlineBelief:
         return belief, Observed(info, refit)
 
     def refit(self, belief: BeliefState) -> tuple[BeliefState, RefitInfo]:
-        """Fit every block anew to the table; takes seconds, not for `jit`.
+        """Fit every block anew to the table; not for `jit`.
 
         Where a block's readings have looked odd since some row, and its world is found
         to have changed then, its rows before that are left out from now on.

@@ -17,7 +17,7 @@ from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.track_data import TrackRow
 from boomdp_jax.inference.tracking import Gains, predictor, track_row
 
-# Points of a chunk: enough to fill vectors, few enough that hardly any are padding.
+# Points of a chunk: enough to fill vectors, few enough that not too many are padding.
 _CHUNK = 64
 
 Tracked = tuple[Float[Array, "point body 6"], Float[Array, "point body 4"]]
@@ -41,14 +41,15 @@ def track_points(
         end: row after the last one; the cost is in proportion to the rows between.
     """
     likelihood = likelihood_of(target)
-    num = structure.shape[0]
+    num, num_levels = structure.shape[0], num_levels_of(target)
     shape = likelihood.data.steps.state.shape[1:]
-    source, owner, num_chunks = _chunks(structure, target.num_structures)
+    level = levels_of(target, structure, z)
+    source, owner, num_chunks = _chunks(level, num_levels * target.num_structures)
 
     def one_chunk(index, carry):
         mean, square = carry
         chosen, k = source[index], owner[index]
-        gains, active = likelihood.gains_of(k), target.structures[k]
+        gains, active = likelihood.gains_of(k), target.structures[k // num_levels]
         found = jax.vmap(lambda z: _track(likelihood, z, active, gains, begin, end))(
             z[jnp.minimum(chosen, num - 1)]
         )
@@ -121,23 +122,23 @@ def track_one_row(
         z: coordinates of each point.
         mean: state of each point before the row.
         row: its readings.
-        gains: for the row, with a leading structure axis.
+        gains: for the row, with a leading level axis.
     """
     likelihood = likelihood_of(target)
     coordinates = likelihood.coordinates
 
-    def one(k, z, mean):
+    def one(k, level, z, mean):
         params = coordinates(z, target.structures[k])
         predict = predictor(coordinates.world, params, likelihood.data.steps.dt)
-        gain = jax.tree.map(lambda leaf: leaf[k], gains)
+        gain = jax.tree.map(lambda leaf: leaf[level], gains)
         state, whitened = track_row(predict, mean, row, gain)
         return state, group_sums(whitened[None] ** 2)
 
-    return jax.vmap(one)(structure, z, mean)
+    return jax.vmap(one)(structure, levels_of(target, structure, z), z, mean)
 
 
 def tally_of(target: StructureTarget) -> Tally:
-    """Count innovations and add up whitenings over the table, for every structure."""
+    """Count innovations and add up whitenings over the table, for every level."""
     likelihood = likelihood_of(target)
     each = jax.vmap(lambda g: (likelihood.num_counted(g), likelihood.log_volume(g)))
     return Tally(*each(likelihood.gains))
@@ -147,7 +148,7 @@ def tally_row(gains: Gains) -> Tally:
     """The same for a single row.
 
     Args:
-        gains: for the row, with a leading structure axis.
+        gains: for the row, with a leading level axis.
     """
 
     def one(gains: Gains) -> tuple[Array, Array]:
@@ -160,15 +161,15 @@ def tally_row(gains: Gains) -> Tally:
 def log_likelihoods(
     target: StructureTarget,
     tally: Tally,
-    structure: Int[Array, " point"],
+    level: Int[Array, " point"],
     square: Float[Array, "point body 4"],
 ) -> Float[Array, " point"]:
     """Log-likelihoods of points from their statistics.
 
     Args:
         target: with a `FilteredLikelihood`.
-        tally: what all points of a structure share.
-        structure: of each point.
+        tally: what all points of a level share.
+        level: of each point, see `levels_of`.
         square: sums of squared innovations of each point.
     """
     likelihood = likelihood_of(target)
@@ -180,7 +181,32 @@ def log_likelihoods(
             statistics, tally.log_volume[k], likelihood.reference[k]
         )
 
-    return jax.vmap(one)(structure, square)
+    found = jax.vmap(one)(level, square)
+    return found if likelihood.offset is None else found + likelihood.offset[level]
+
+
+def num_levels_of(target: StructureTarget) -> int:
+    """Levels of noise of each structure."""
+    reference = likelihood_of(target).reference
+    assert reference is not None
+    return reference.shape[-3] // target.num_structures
+
+
+def levels_of(
+    target: StructureTarget,
+    structure: Int[Array, " point"],
+    z: Float[Array, "point dim"],
+) -> Int[Array, " point"]:
+    """Which gains a point has: those of its structure and of its level of noise.
+
+    Where there are several levels the last coordinate says which: it is uniform over
+    one period, of which each level takes an equal part.
+    """
+    num = num_levels_of(target)
+    if num == 1:
+        return structure
+    part = jnp.floor(num * (z[:, -1] / target.period[-1] + 0.5)).astype(structure.dtype)
+    return num * structure + jnp.clip(part, 0, num - 1)
 
 
 def likelihood_of(target: StructureTarget) -> FilteredLikelihood:

@@ -20,7 +20,11 @@ from boomdp_jax.core.arrays import FloatScalar, IntScalar, Key
 from boomdp_jax.inference.laplace_mixture import LaplaceMixture, make_mixture
 from boomdp_jax.inference.moves import Point, Proposal, accept, propose_walk
 from boomdp_jax.inference.noise import Noise, draw_noise, pick
-from boomdp_jax.inference.online_likelihood import log_likelihoods, track_points
+from boomdp_jax.inference.online_likelihood import (
+    levels_of,
+    log_likelihoods,
+    track_points,
+)
 from boomdp_jax.inference.online_state import BlockBelief, ParticleSet
 from boomdp_jax.inference.target import StructureTarget
 
@@ -231,7 +235,8 @@ def log_densities(
 ) -> Float[Array, " point"]:
     """Log-prior plus log-likelihood of points whose statistics are known."""
     log_prior = jax.vmap(block.target.log_prior_density)(structure, z)
-    found = log_likelihoods(block.target, block.tally, structure, square)
+    level = levels_of(block.target, structure, z)
+    found = log_likelihoods(block.target, block.tally, level, square)
     return log_prior + jnp.where(found > -1e29, found, -jnp.inf)
 
 

@@ -14,8 +14,9 @@ from boomdp_jax.inference.contact_numbers import with_contact_numbers
 from boomdp_jax.inference.decode import decode
 from boomdp_jax.inference.evidence_report import BlockResult
 from boomdp_jax.inference.noise import host_generator
+from boomdp_jax.inference.noise_levels import without_levels
 from boomdp_jax.inference.one_step import NOISE_SHAPE
-from boomdp_jax.inference.online_likelihood import log_likelihoods
+from boomdp_jax.inference.online_likelihood import levels_of, log_likelihoods
 from boomdp_jax.inference.online_state import BlockBelief
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.resampling import systematic
@@ -107,9 +108,8 @@ def best_params(spec: SceneSpec, parts: list[tuple[Block, BlockBelief]]) -> Para
     for block, belief in parts:
         target, particles = belief.target, belief.particles
         likelihood: Any = target.log_likelihood
-        value = log_likelihoods(
-            target, belief.tally, particles.structure, particles.square
-        )
+        level = levels_of(target, particles.structure, particles.z)
+        value = log_likelihoods(target, belief.tally, level, particles.square)
         prior = jax.vmap(target.log_prior_density)(particles.structure, particles.z)
         density = np.asarray(value + prior, float)
         weight = np.exp(np.asarray(particles.log_weight, float))
@@ -148,15 +148,17 @@ def _result(
     target, particles, tally = belief.target, belief.particles, belief.tally
     likelihood: Any = target.log_likelihood
     structure, z = np.asarray(particles.structure), np.asarray(particles.z)
-    value = log_likelihoods(target, tally, particles.structure, particles.square)
+    level = levels_of(target, particles.structure, particles.z)
+    value = log_likelihoods(target, tally, level, particles.square)
     prior = jax.vmap(target.log_prior_density)(particles.structure, particles.z)
     log_density = np.asarray(value + prior, float)
-    reference = np.asarray(likelihood.reference, float)[structure]
+    own = np.asarray(level)
+    reference = np.asarray(likelihood.reference, float)[own]
     scale = np.asarray(likelihood.coordinates.scales.noise, float)[None] / reference
-    num = np.asarray(tally.num, float)[structure]
+    num = np.asarray(tally.num, float)[own]
     rate = scale**2 + 0.5 * np.asarray(particles.square, float)
     noise = reference * np.sqrt(rate / rng.gamma(NOISE_SHAPE + 0.5 * num))
-    # Fitted, one for a structure: between refits the noise of the motion stays.
+    # Between refits the noise of the motion is one of a few.
     impulse = np.asarray(belief.champions.noise.impulse)
     weight = np.exp(np.asarray(particles.log_weight, float))
     size = float(weight.sum() ** 2 / (weight**2).sum())
@@ -172,13 +174,13 @@ def _result(
     )
     draws = BlockDraws(
         structure=structure[rows][None],
-        z=z[rows][None],
+        z=z[rows, : block.layout.dim][None],
         log_density=log_density[rows][None],
         noise_scale=noise[rows].astype(z.dtype)[None],
-        impulse_scale=impulse[structure[rows]][None],
+        impulse_scale=impulse[own[rows]][None],
         log_evidence=np.array([np.nan]),
         evidence=None,
         diagnostics=[verdict],
         chain_index=np.arange(1),
     )
-    return BlockResult(block._replace(target=target), draws, 0)
+    return BlockResult(block._replace(target=without_levels(target)), draws, 0)

@@ -1,8 +1,10 @@
 """The slow part of an online belief: fit anew, and ask whether the world has changed.
 
-A refit finds the modes of every structure on the rows in the table, builds a mixture on
-them, and tempers fresh particles from it to the posterior, so that it does not matter
-how wrong the particles before were. Where readings have ceased to look as expected
+A refit finds the modes of every structure on the rows in the table, chooses levels of
+noise, builds a mixture and draws fresh particles (`online_renew`). Mostly it goes on
+from the modes that were best (`warm_modes`); where little was known before, or that may
+be wrong, it looks everywhere (`find_modes`), and does not depend on how wrong particles
+were. Where readings have ceased to look as expected
 since some row, it weighs two accounts by their evidence: one world all along (perhaps
 another one than was believed), or two, of which the rows since then tell of the second
 alone (Barry and Hartigan 1993, A Bayesian analysis for change point problems). Both
@@ -18,40 +20,35 @@ import numpy as np
 
 from boomdp_jax.core.arrays import Key, on_device
 from boomdp_jax.core.history import History
-from boomdp_jax.core.quick_compile import QuickCompile
-from boomdp_jax.inference.adapt_mixture import adapt_mixtures
-from boomdp_jax.inference.block import Block, make_block, stack_blocks
+from boomdp_jax.inference.block import Block, stack_blocks
 from boomdp_jax.inference.filter_points import filter_points
-from boomdp_jax.inference.find_modes import Found, find_modes
-from boomdp_jax.inference.fit import FitSettings, Modes
-from boomdp_jax.inference.kalman import NoiseLevel
-from boomdp_jax.inference.laplace_mixture import LaplaceMixture
+from boomdp_jax.inference.fit import Modes
 from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.noise_level import NoiseFit
-from boomdp_jax.inference.online_likelihood import tally_of, track_points
-from boomdp_jax.inference.online_state import (
-    BlockBelief,
-    Champions,
-    ParticleSet,
-    Suspicion,
+from boomdp_jax.inference.noise_levels import evenly_levelled
+from boomdp_jax.inference.online_fit import (
+    FIRST_TEST,
+    Fitter,
+    RefitSettings,
+    assemble_belief,
+    num_levels_for,
 )
-from boomdp_jax.inference.online_window import in_whole_table, windowed
+from boomdp_jax.inference.online_state import BlockBelief, FitRecord, Suspicion
 from boomdp_jax.inference.structure_draws import start_mixtures
 from boomdp_jax.inference.target import StructureTarget
-from boomdp_jax.inference.tempered_smc import temper
-from boomdp_jax.inference.typical_noise import with_typical_gains
-from boomdp_jax.inference.weighing import evaluate_each
-from boomdp_jax.physics.scene_spec import SceneSpec
 
-# Draws of each round that adapts the mixture, and rounds: tempering comes after.
-_NUM_DRAWS, _NUM_ROUNDS = 1024, 2
-# A change is looked for when so many rows have come since readings grew odd, again
-# after twice as many, and no more after the last number.
-FIRST_TEST, _LAST_TEST = 4, 64
+# A change is looked for again after twice as many rows as before, and no more after
+# this number.
+_LAST_TEST = 64
 # Log-odds beyond which a question is settled.
 _SETTLED = 5.0
 # Impulses to begin with, in units of the prior scale of velocity readings.
 _FIRST_IMPULSE = 0.1
+# Modes are looked for everywhere after so many refits that went on from known ones.
+_MOST_WARM = 8
+# With fewer particles in effect a belief is no place to start from, and with a smaller
+# share of those weighed its refit has failed.
+_FEWEST, _POOR = 8.0, 0.02
 
 
 class BlockRefit(NamedTuple):
@@ -63,8 +60,10 @@ class BlockRefit(NamedTuple):
     """Two worlds against one, prior odds included; None where nobody asked."""
     changed_at: int | None
     """Row of the table, before the refit, since which there is another world."""
-    power: float
-    """Of the target that tempering reached; 1 unless it took too many steps."""
+    effective_sample_size: float
+    """Of the particles drawn, before they were resampled and moved."""
+    is_warm: bool
+    """Whether the fit began at modes known before, instead of looking everywhere."""
 
 
 class RefitInfo(NamedTuple):
@@ -77,27 +76,6 @@ class RefitInfo(NamedTuple):
     def has_changed(self) -> bool:
         """Whether some block's world was found to have changed."""
         return any(block.changed_at is not None for block in self.blocks)
-
-
-class _Account(NamedTuple):
-    """A fit of some of the rows."""
-
-    block: Block
-    found: Found
-    mixtures: LaplaceMixture
-    log_evidence: float
-
-
-class RefitSettings(NamedTuple):
-    """What stays the same from refit to refit."""
-
-    spec: SceneSpec
-    num_particles: int
-    is_uniform: bool
-    forgetting: float
-    change_rate: float
-    """Prior probability that the world changes, per transition."""
-    fit: FitSettings = FitSettings()
 
 
 def prior_belief(key: Key, settings: RefitSettings, block: Block) -> BlockBelief:
@@ -118,7 +96,6 @@ def prior_belief(key: Key, settings: RefitSettings, block: Block) -> BlockBelief
     gains = jax.tree.map(lambda x: on_device(0 * np.asarray(x)), likelihood.gains)
     targets = eqx.tree_at(lambda t: t.log_likelihood.gains, targets, gains)
     rng = host_generator(key)
-    structure, z = _prior_draws(rng, block.target, settings.num_particles)
     num_structures, dim = block.target.num_structures, block.target.dim
     scale = np.asarray(likelihood.coordinates.scales.noise, float)[0]
     reading = np.tile(scale, (len(bodies), 1))
@@ -137,9 +114,22 @@ def prior_belief(key: Key, settings: RefitSettings, block: Block) -> BlockBelief
         precision=on_device(np.tile(np.eye(dim), (1, num_structures * num_each, 1, 1))),
         log_density=on_device(value.reshape(1, -1)),
     )
+    each, champion = np.arange(num_structures), np.zeros((num_structures, dim))
+    filtered = filter_points(targets, 0 * each, each, champion, noise)
+    levelled = evenly_levelled(
+        targets, champion, noise, filtered, num_levels_for(bodies)
+    )
     mixtures = start_mixtures(targets, modes)
+    target = jax.tree.map(lambda leaf: leaf[0], levelled.targets)
+    structure, z = _prior_draws(rng, target, settings.num_particles)
     capacity = likelihood.data.start.shape[1]
-    return _assemble(targets, modes, noise, mixtures, structure, z, 0, 0, capacity)
+    belief = assemble_belief(levelled, mixtures, settings.num_particles, 0, 0, capacity)
+    dtype = belief.particles.z.dtype
+    return eqx.tree_at(
+        lambda b: (b.particles.structure, b.particles.z),
+        belief,
+        (on_device(structure, np.dtype(np.int32)), on_device(z, dtype)),
+    )
 
 
 def refit_block(
@@ -171,22 +161,27 @@ def refit_block(
         and num_after >= FIRST_TEST
         and (bool(suspicion.is_open) or float(suspicion.log_factor) > 0)
     )
-    all_key, after_key, before_key, temper_key = jax.random.split(key, 4)
-    whole = windowed(history, begin, num_rows, since if is_asked else None)
-    account = _fit(all_key, settings, bodies, whole)
+    all_key, again_key, after_key, before_key = jax.random.split(key, 4)
+    fit = Fitter(settings, bodies, history)
+    is_warm = not is_asked and _is_known(belief)
+    account = None
+    if is_warm:
+        account = fit(all_key, begin, num_rows, known=belief)
+        if account is not None:
+            is_poor = account.effective_sample_size < _POOR * settings.num_particles
+            account = None if is_poor else account
+    if account is None:
+        is_warm = False
+        cut = since if is_asked else None
+        account = fit(again_key, begin, num_rows, cut=cut)
+        assert account is not None
     log_odds, is_changed, next_test = None, False, FIRST_TEST
     is_open = False
     if is_asked:
-        after = _fit(
-            after_key, settings, bodies, windowed(history, since, num_rows, None)
-        )
-        before = _fit(
-            before_key,
-            settings,
-            bodies,
-            windowed(history, begin, since, None),
-            age=num_after,
-        )
+        after = fit(after_key, since, num_rows)
+        before = fit(before_key, begin, since, age=num_after)
+        assert after is not None
+        assert before is not None
         log_odds = after.log_evidence + before.log_evidence - account.log_evidence
         log_odds += np.log(settings.change_rate)
         is_changed = log_odds > _SETTLED
@@ -195,154 +190,32 @@ def refit_block(
         next_test = 2 * num_after if is_open else FIRST_TEST
         if is_changed:
             account, begin = after, since
-    rng = host_generator(temper_key)
-    targets = account.found.targets
-    end = temper(rng, targets, account.mixtures, settings.num_particles, evaluate_each)
-    points = end.particles.points
-    order = rng.permutation(settings.num_particles)
-    fresh = _assemble(
-        targets,
-        account.found.modes,
-        account.found.noise,
-        account.mixtures,
-        np.asarray(points.structure)[0][order],
-        np.asarray(points.z)[0][order],
-        begin,
-        num_rows,
-        history.capacity,
-    )
     kept = Suspicion(
         log_factor=jnp.zeros_like(suspicion.log_factor),
         since=on_device(since if is_open else -1, suspicion.since.dtype),
         test_after=on_device(next_test, suspicion.test_after.dtype),
         is_open=on_device(is_open, bool),
     )
-    fresh = eqx.tree_at(lambda b: b.suspicion, fresh, kept)
+    old, integer = belief.fit, belief.begin.dtype
+    num_fitted = int(old.num_rows) if is_warm else num_rows - begin
+    num_since = int(old.num_since) + 1 if is_warm else 0
+    record = FitRecord(on_device(num_fitted, integer), on_device(num_since, integer))
+    fresh = eqx.tree_at(lambda b: (b.suspicion, b.fit), account.belief, (kept, record))
     return fresh, BlockRefit(
         log_evidence=account.log_evidence,
         log_odds_of_change=None if log_odds is None else float(log_odds),
         changed_at=since if is_changed else None,
-        power=float(end.power[0]),
+        effective_sample_size=account.effective_sample_size,
+        is_warm=is_warm,
     )
 
 
-def make_online_block(
-    settings: RefitSettings,
-    bodies: tuple[int, ...],
-    history: History,
-    *,
-    age: int = 0,
-) -> Block:
-    """A block whose rows count as forgetting has it.
-
-    Args:
-        settings: what stays the same.
-        bodies: indices of the block's bodies in the scene.
-        history: readings of the whole scene.
-        age: transitions since its last row.
-    """
-    weight = None
-    if settings.forgetting < 1.0:
-        num_rows = int(np.asarray(history.mask).nonzero()[0].max(initial=-1)) + 1
-        behind = np.maximum(num_rows - 1 - np.arange(history.capacity), 0)
-        weight = settings.forgetting ** (age + behind)
-    return make_block(
-        settings.spec, bodies, history, is_uniform=settings.is_uniform, weight=weight
-    )
-
-
-def _fit(
-    key: Key,
-    settings: RefitSettings,
-    bodies: tuple[int, ...],
-    history: History,
-    *,
-    age: int = 0,
-) -> _Account:
-    """Modes, mixture and evidence on the rows of a history that ended some time ago."""
-    fit_key, draw_key = jax.random.split(key)
-    block = make_online_block(settings, bodies, history, age=age)
-    rng = host_generator(draw_key)
-    found = find_modes(fit_key, stack_blocks([block]), settings.fit)
-    found = with_typical_gains(rng, found, settings.fit)
-    mixtures, evidence = adapt_mixtures(
-        rng,
-        found.targets,
-        start_mixtures(found.targets, found.modes),
-        _NUM_DRAWS,
-        evaluate_each,
-        max_rounds=_NUM_ROUNDS,
-    )
-    each = np.asarray(evidence.log_evidence, float)[0]
-    each = each + np.asarray(found.targets.log_prior, float)[0]
-    return _Account(block, found, mixtures, float(np.logaddexp.reduce(each)))
-
-
-def _assemble(
-    targets: StructureTarget,
-    modes: Modes,
-    noise: NoiseFit,
-    mixtures: LaplaceMixture,
-    structure: np.ndarray,
-    z: np.ndarray,
-    begin: int,
-    end: int,
-    capacity: int,
-) -> BlockBelief:
-    """The belief of equally weighted particles, filtered up to the last row."""
-    num_structures = targets.structures.shape[1]
-    num_particles = len(structure)
-    dtype = targets.log_prior.dtype
-    integer = jnp.zeros((), int).dtype
-    champion = np.asarray(modes.z, float)[0].reshape(num_structures, -1, z.shape[-1])
-    champion = np.ascontiguousarray(champion[:, 0])
-    each = np.zeros(num_structures, int)
-    found = filter_points(targets, each, np.arange(num_structures), champion, noise)
-    share = np.bincount(structure, minlength=num_structures)
-    # Rows beyond the last one are padding.
-    estimate = jax.tree.map(lambda leaf: leaf[:, max(end - begin, 1) - 1], found.after)
-    starts = np.asarray(found.starts)[int(np.argmax(share))]
-    targets, starts = in_whole_table(targets, starts, begin, capacity)
-    target = jax.tree.map(lambda leaf: leaf[0], targets)
-    places = on_device(structure, np.dtype(np.int32)), on_device(z, dtype)
-    bounds = on_device(begin, integer), on_device(end, integer)
-    tally, mean, square = _track(target, *places, *bounds)
-    mixture = jax.tree.map(lambda leaf: leaf[0], mixtures)
-    return BlockBelief(
-        target=target,
-        champions=Champions(
-            z=on_device(champion, dtype),
-            estimate=jax.tree.map(lambda x: on_device(x, dtype), estimate),
-            noise=NoiseLevel(
-                on_device(noise.reading, dtype), on_device(noise.impulse, dtype)
-            ),
-        ),
-        tally=tally,
-        particles=ParticleSet(
-            structure=places[0],
-            z=places[1],
-            log_weight=on_device(np.full(num_particles, -np.log(num_particles)), dtype),
-            mean=mean,
-            square=square,
-        ),
-        mixture=mixture,
-        base_log_weight=mixture.log_weight,
-        starts=on_device(starts, dtype),
-        begin=bounds[0],
-        step_size=on_device(0.5, dtype),
-        num_moves=on_device(0, integer),
-        suspicion=Suspicion(
-            log_factor=on_device(0.0, dtype),
-            since=on_device(-1, integer),
-            test_after=on_device(FIRST_TEST, integer),
-            is_open=on_device(False, bool),
-        ),
-    )
-
-
-@QuickCompile
-def _track(target: StructureTarget, structure, z, begin, end):
-    return tally_of(target), *track_points(target, structure, z, begin, end)
+def _is_known(belief: BlockBelief) -> bool:
+    """Whether a belief is one to go on from."""
+    weight = np.exp(np.asarray(belief.particles.log_weight, float))
+    size = weight.sum() ** 2 / np.sum(weight**2)
+    num_rows, num_since = int(belief.fit.num_rows), int(belief.fit.num_since)
+    return num_rows > 0 and num_since < _MOST_WARM and bool(size >= _FEWEST)
 
 
 def _prior_draws(

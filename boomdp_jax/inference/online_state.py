@@ -24,22 +24,25 @@ class ParticleSet(eqx.Module):
 
 
 class Tally(eqx.Module):
-    """What all hypotheses of a structure share of the noise's statistics."""
+    """What all hypotheses of a structure and a level of noise share of statistics."""
 
-    num: Float[Array, "*member structure body 4"]
+    num: Float[Array, "*member level body 4"]
     """Innovations that count."""
-    log_volume: Float[Array, "*member structure"]
+    log_volume: Float[Array, "*member level"]
     """Log-determinant of all whitenings."""
 
 
 class Champions(eqx.Module):
-    """One hypothesis of each structure, whose Kalman filter gives the gains."""
+    """A hypothesis and noises of each structure, whose Kalman filters give the gains.
 
-    z: Float[Array, "*member structure dim"]
+    Structure after structure, and for each one level of noise after the other.
+    """
+
+    z: Float[Array, "*member level dim"]
     estimate: Estimate
-    """After the last row; leading axes `*member structure`."""
+    """After the last row; leading axes `*member level`."""
     noise: NoiseLevel
-    """Of readings and motion, leading axes `*member structure`."""
+    """Of readings and motion, leading axes `*member level`."""
 
 
 class Suspicion(eqx.Module):
@@ -53,6 +56,15 @@ class Suspicion(eqx.Module):
     """Rows since then at which a refit should look for a change."""
     is_open: Bool[Array, "*member"]
     """Whether a refit has looked and could not tell."""
+
+
+class FitRecord(eqx.Module):
+    """How the modes that a belief rests on were found."""
+
+    num_rows: Int[Array, "*member"]
+    """Rows that were fitted when modes were last looked for everywhere; 0: never."""
+    num_since: Int[Array, "*member"]
+    """Refits since then, which began at modes known before."""
 
 
 class BlockBelief(eqx.Module):
@@ -76,6 +88,7 @@ class BlockBelief(eqx.Module):
     num_moves: Int[Array, "*member"]
     """Moves made so far, each of a part of the particles."""
     suspicion: Suspicion
+    fit: FitRecord
 
 
 class BeliefState(eqx.Module):

@@ -21,8 +21,10 @@ from jaxtyping import Array, Bool, Float, Int
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar, Key
 from boomdp_jax.inference.kalman import RowFilter
 from boomdp_jax.inference.online_likelihood import (
+    levels_of,
     likelihood_of,
     log_likelihoods,
+    num_levels_of,
     tally_of,
     tally_row,
     track_one_row,
@@ -81,9 +83,8 @@ def drop_block_rows(block: BlockBelief, num: int) -> BlockBelief:
     """Take the oldest rows off a full table and weigh the particles anew."""
     likelihood, particles = likelihood_of(block.target), block.particles
     end = likelihood.data.start.shape[0] - num
-    before = log_likelihoods(
-        block.target, block.tally, particles.structure, particles.square
-    )
+    level = levels_of(block.target, particles.structure, particles.z)
+    before = log_likelihoods(block.target, block.tally, level, particles.square)
     data = drop_track_rows(likelihood.data, block.starts, num)
     gains = jax.vmap(lambda leaf: shift_rows(leaf, num))(likelihood.gains)
     target = eqx.tree_at(
@@ -96,7 +97,7 @@ def drop_block_rows(block: BlockBelief, num: int) -> BlockBelief:
     mean, square = track_points(
         target, particles.structure, particles.z, begin, jnp.asarray(end)
     )
-    after = log_likelihoods(target, tally, particles.structure, square)
+    after = log_likelihoods(target, tally, level, square)
     log_weight = _normalised(particles.log_weight + after - before)
     particles = eqx.tree_at(
         lambda p: (p.log_weight, p.mean, p.square),
@@ -196,17 +197,17 @@ def _filter_row(
         params = coordinates(z, active)
         return RowFilter(coordinates.world, params, dt, noise)(estimate, row)
 
+    active = jnp.repeat(target.structures, num_levels_of(target), axis=0)
     estimate, found = jax.vmap(take)(
-        champions.z, target.structures, champions.estimate, champions.noise
+        champions.z, active, champions.estimate, champions.noise
     )
     # A champion that has lost its way gives gains that count for nothing.
     gains = jax.tree.map(lambda leaf: jnp.nan_to_num(leaf), found.gains)
     mean, added = track_one_row(
         target, particles.structure, particles.z, particles.mean, row, gains
     )
-    share = jax.ops.segment_sum(
-        jnp.exp(particles.log_weight), particles.structure, target.num_structures
-    )
+    k = levels_of(target, particles.structure, particles.z)
+    share = jax.ops.segment_sum(jnp.exp(particles.log_weight), k, champions.z.shape[0])
     start = found.start[jnp.argmax(share)]
     new_gains = jax.tree.map(
         lambda table, one: table.at[:, index].set(one), likelihood.gains, gains
@@ -218,7 +219,6 @@ def _filter_row(
         (data, new_gains),
     )
     tally, square = block.tally, particles.square
-    k = particles.structure
     one = tally_row(gains)
     faded = Tally(forgetting * tally.num, forgetting * tally.log_volume)
     faded_square = forgetting * square

@@ -3,8 +3,9 @@
 from typing import NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import on_device
 from boomdp_jax.core.history import History
@@ -52,6 +53,14 @@ class TrackData(eqx.Module):
     """As how many times its likelihood each row counts; None: as one."""
     freedom: float | None = eqx.field(static=True, default=None)
     """Degrees of freedom of the readings' Student-t noise; None: it is normal."""
+
+    @property
+    def is_used(self) -> Bool[Array, "*batch time"]:
+        """Whether a row, or some row after it, was read or goes on from another."""
+        read = jnp.any((self.first_mask > 0) | (self.last_mask > 0), axis=(-2, -1))
+        row = read | (self.is_start == 0)
+        num_left = jnp.cumsum(jnp.flip(row, -1), axis=-1)
+        return jnp.flip(num_left, -1) > 0
 
     @property
     def rows(self) -> TrackRow:

@@ -20,7 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import FloatScalar, on_device
 from boomdp_jax.inference.contact_prediction import (
@@ -30,6 +30,7 @@ from boomdp_jax.inference.contact_prediction import (
     predict_step,
 )
 from boomdp_jax.inference.track_data import TrackData, TrackRow, with_delay
+from boomdp_jax.inference.used_rows import scan_used
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import state_from_array
@@ -188,7 +189,11 @@ def cloud_predictor(
 
 
 def innovations(
-    scene: Scene | ContactScene, params: Params, data: TrackData, gains: Gains
+    scene: Scene | ContactScene,
+    params: Params,
+    data: TrackData,
+    gains: Gains,
+    is_used: Bool[Array, " time"] | None = None,
 ) -> Float[Array, "time 2 body 6"]:
     """Whitened innovations of all readings, zero where nothing was read.
 
@@ -197,6 +202,7 @@ def innovations(
         params: one hypothesis.
         data: the block's readings.
         gains: of the hypothesis's structure.
+        is_used: as `scan_used` has it.
 
     Returns:
         Of the reading that a row starts from and of the one that it ends at;
@@ -210,7 +216,7 @@ def innovations(
 
     shape = data.steps.state.shape[1:]
     if math.prod(shape) > _MAX_WRITTEN_OUT:
-        return jax.lax.scan(advance, jnp.zeros(shape), (data.rows, gains))[1]
+        return scan_used(advance, jnp.zeros(shape), (data.rows, gains), is_used)[1]
 
     # Channel by channel from row to row: a batch of points is then a vector for each,
     # and all arithmetic is on vectors. As one array of channels for each point the
@@ -219,7 +225,7 @@ def innovations(
         return _track_channels(predict, channels, *inputs)
 
     start = list(jnp.zeros(math.prod(shape)))
-    _, whitened = jax.lax.scan(advance_channels, start, (data.rows, gains))
+    _, whitened = scan_used(advance_channels, start, (data.rows, gains), is_used)
     return jnp.stack(whitened, axis=-1).reshape(-1, 2, *shape)
 
 

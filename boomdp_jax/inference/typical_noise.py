@@ -6,6 +6,8 @@ was measured: of sixty rows of a pinned box, posteriors of the mass with gains a
 standard deviation above the peak were twice as wide as those with noise inferred.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from boomdp_jax.inference.find_modes import Found
@@ -25,65 +27,70 @@ from boomdp_jax.inference.noise_proposal import NoiseProposal
 _MOST, _NEAR = 4, 8.0
 
 
-def with_typical_gains(
-    rng: np.random.Generator, found: Found, settings: FitSettings
-) -> Found:
+class TypicalNoise(NamedTuple):
+    """Modes under gains of the mean noise, and what is known of the noise."""
+
+    found: Found
+    chosen: np.ndarray
+    """Structures of the object with a noise of their own, the most probable first."""
+    proposal: NoiseProposal
+    """Of the noise of each of those."""
+
+
+def typical_noise(
+    rng: np.random.Generator,
+    found: Found,
+    settings: FitSettings,
+    *,
+    is_near: bool = False,
+) -> TypicalNoise:
     """Give every structure the gains of the mean noise at its best fit; climb again.
+
+    Where all was near before, modes stay: new gains would move them by little.
 
     Args:
         rng: source of randomness.
-        found: modes, and the targets whose modes they are.
+        found: modes of one object, and the targets whose modes they are.
         settings: how hard to look.
+        is_near: whether noise and modes are known to be near already.
 
     Returns:
         The same with other gains, and the modes that belong to them.
     """
     targets, modes = found.targets, found.modes
-    num_objects, num_structures = targets.structures.shape[:2]
-    value = np.asarray(modes.log_density, float)
-    keep = np.isfinite(value).reshape(-1)
-    index = np.repeat(np.arange(num_objects), value.shape[1])
+    num_structures = targets.structures.shape[1]
+    value = np.asarray(modes.log_density, float)[0]
     dim = modes.z.shape[-1]
     fits = Fits(
-        index,
-        np.asarray(modes.structure).reshape(-1),
-        np.asarray(modes.z, float).reshape(-1, dim),
-        value.reshape(-1),
+        np.zeros(len(value), int),
+        np.asarray(modes.structure)[0],
+        np.asarray(modes.z, float)[0],
+        value,
         np.asarray(modes.precision, float).reshape(-1, dim, dim),
-    ).take(keep)
+    ).take(np.isfinite(value))
     top = best_of_each(fits, num_structures, 1)
     height = top.value - 0.5 * np.linalg.slogdet(top.precision)[1]
-    chosen = _probable(top.index, height)
+    chosen = np.argsort(-height, kind="stable")[:_MOST]
+    chosen = chosen[height[chosen] > height[chosen[0]] - _NEAR]
+    structure = top.structure[chosen]
     proposal = NoiseProposal.fit(
         rng,
         targets,
         top.take(chosen),
         np.arange(len(chosen)),
-        found.noise.take(top.index[chosen] * num_structures + top.structure[chosen]),
+        found.noise.take(structure),
+        is_near=is_near,
     )
-    vector = found.noise.vector
     # The last component is the one that weighed draws were fitted by.
     typical = proposal.center[:, -1]
-    best: dict[int, np.ndarray] = {}
-    for row, mean in zip(chosen, typical, strict=True):
-        best.setdefault(int(top.index[row]), mean)
-    for number in range(num_objects):
-        vector[number * num_structures : (number + 1) * num_structures] = best[number]
-    vector[top.index[chosen] * num_structures + top.structure[chosen]] = typical
+    vector = np.tile(typical[0], (num_structures, 1))
+    vector[structure] = typical
     noise = NoiseFit.of_vector(vector)
+    if is_near:
+        return TypicalNoise(found._replace(noise=noise), structure, proposal)
     # In a world of another law some structure may have no fit that is finite.
-    mine = top.index * num_structures + top.structure
-    targets = with_gains(targets, top, noise.take(mine))
+    targets = with_gains(targets, top, noise.take(top.structure))
     again = make_fits(targets, fits.index, fits.structure, fits.z)
     fits = climb(targets, again, settings.num_repeats)
-    return Found(targets, collect_modes(targets, fits, settings.num_modes), noise)
-
-
-def _probable(index: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Rows of each object's highest few, highest first."""
-    rows = []
-    for number in np.unique(index):
-        mine = np.flatnonzero(index == number)
-        mine = mine[np.argsort(-height[mine], kind="stable")][:_MOST]
-        rows.append(mine[height[mine] > height[mine[0]] - _NEAR])
-    return np.concatenate(rows)
+    modes = collect_modes(targets, fits, settings.num_modes)
+    return TypicalNoise(Found(targets, modes, noise), structure, proposal)

@@ -7,10 +7,10 @@ import pytest
 from scipy.stats import kstest, multivariate_t
 
 from boomdp_jax.inference.chunking import (
-    MAX_CHUNKS,
     MAX_OWNERS,
     Chunking,
     for_each_chunk,
+    max_chunks,
 )
 from boomdp_jax.inference.fit_noise import NoisePeaks
 from boomdp_jax.inference.noise_level import NoiseFit
@@ -73,8 +73,8 @@ def test_every_point_gets_its_own_result(num_points, num_workers):
         sizes.append(call.num)
         owners, rows = call.owners[call.owner[: call.num]], call.rows[: call.num]
         assert call.owners.shape == (MAX_OWNERS, 2)
-        assert call.owner.shape == (MAX_CHUNKS,)
-        assert len(call.rows) == MAX_CHUNKS
+        assert call.owner.shape == (max_chunks(),)
+        assert len(call.rows) == max_chunks()
         assert np.all(index[rows] == owners[:, :1])
         assert np.all(structure[rows] == owners[:, 1:])
         found.append(value[rows])

@@ -26,6 +26,7 @@ from boomdp_jax.inference.online_rows import (
 from boomdp_jax.inference.online_state import (
     BlockBelief,
     Champions,
+    FitRecord,
     ParticleSet,
     Suspicion,
     Tally,
@@ -203,6 +204,7 @@ def test_the_mixture_is_fitted_to_the_particles_of_each_structure():
         step_size=zero,
         num_moves=integer,
         suspicion=Suspicion(zero, integer, integer, jnp.asarray(False)),
+        fit=FitRecord(integer, integer),
     )
     fitted = jax.jit(fit_mixture)(block)
     share = np.bincount(structure, minlength=6) / num

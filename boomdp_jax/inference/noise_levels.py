@@ -1,0 +1,338 @@
+r"""A few levels of noise for each structure, and gains for each: noise averaged over.
+
+A filter's gains take the ratios of noises as known. So each structure k has some draws
+$\eta_m$ of all noises, and a hypothesis is a structure, coordinates and one of these
+levels. With $L_m$ the likelihood under the gains of level m, $\hat z_k$ the best fit,
+$Z_k = \int p(\eta) L(h \mid k, \hat z_k, \eta)\,d\eta$, and $v_m$ the posterior
+density of $\eta_m$ at that fit over the density by which it was chosen,
+
+$$L(h \mid k, z, m) = Z_k \, v_m L_m(z) / L_m(\hat z_k),$$
+
+whose mean over levels is the importance estimate of the likelihood with the noise
+integrated out. Levels are chosen in proportion to their own Laplace evidence. At the
+best fit alone noise would be taken for too small: the larger it is, the more hypotheses
+agree with the readings. Which level a hypothesis has is one coordinate more, uniform
+over one period, of which each level takes an equal part: samplers need to know nothing
+of it.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from boomdp_jax.core.arrays import on_device
+from boomdp_jax.core.quick_compile import QuickCompile
+from boomdp_jax.inference.evaluate import evaluate_points, log_prior_density
+from boomdp_jax.inference.filter_points import filter_points
+from boomdp_jax.inference.fit import Fits, Host, normal_equations
+from boomdp_jax.inference.fit_noise import NoiseDensity
+from boomdp_jax.inference.kalman import Filtered
+from boomdp_jax.inference.laplace_mixture import LaplaceMixture, make_mixture
+from boomdp_jax.inference.noise_level import NoiseFit
+from boomdp_jax.inference.resampling import systematic
+from boomdp_jax.inference.target import StructureTarget
+from boomdp_jax.inference.typical_noise import TypicalNoise
+
+# Draws of the noise of each structure, from which levels are chosen, and those of them
+# of which it is worked out how much they leave open.
+_NUM_DRAWS, _NUM_TRIES = 256, 16
+# Of the regression, in tries.
+_RIDGE = 0.5
+# Power of what noises leave open by which they are chosen. By one they would be chosen
+# as they are likely; the rare ones that leave most open make half of a variance.
+_TILT = 1.4
+
+
+class Levelled(NamedTuple):
+    """A target with levels, on the rows of a table, and the filters of all levels."""
+
+    targets: StructureTarget
+    champion: np.ndarray
+    """Hypothesis of each level, `[level, dim]`."""
+    noise: NoiseFit
+    """Of each level."""
+    filtered: Filtered
+    """Of each level, on the host."""
+
+
+def with_levels(
+    rng: np.random.Generator, typical: TypicalNoise, num_levels: int
+) -> Levelled:
+    """Choose levels of noise for every structure of an object.
+
+    Structures that are out of the question have one level, repeated.
+
+    Args:
+        rng: source of randomness.
+        typical: modes of one object under gains of the mean noise.
+        num_levels: of each structure.
+    """
+    targets, modes, middle = typical.found
+    num_structures, dim = targets.structures.shape[1], modes.z.shape[-1]
+    first = np.arange(num_structures) * (len(modes.z[0]) // num_structures)
+    champion = np.asarray(modes.z, float)[0, first]
+    value = np.asarray(modes.log_density, float)[0, first]
+    each = np.arange(num_structures)
+    if num_levels == 1:
+        filtered = filter_points(targets, 0 * each, each, champion, middle)
+        targets = _rowed(targets, each, middle, filtered)
+        return evenly_levelled(targets, champion, middle, filtered, 1)
+    chosen = typical.chosen
+    precision = np.asarray(modes.precision, float).reshape(-1, dim, dim)[first]
+    found = [
+        _choose(rng, typical, place, champion[k], precision[k], num_levels)
+        for place, k in enumerate(chosen)
+    ]
+    others = np.setdiff1d(each, chosen)
+    left = middle.take(others)
+    filtered = filter_points(targets, 0 * others, others, champion[others], left)
+    # Rows of all that was filtered, for every structure and level.
+    source = np.zeros((num_structures, num_levels), int)
+    source[chosen] = np.arange(len(chosen) * num_levels).reshape(-1, num_levels)
+    source[others] = len(chosen) * num_levels + np.arange(len(others))[:, None]
+    rows = source.reshape(-1)
+    parts = [(levels.noise, levels.filtered) for levels in found]
+    parts += [(left, filtered)] if len(others) else []
+    noise, filtered = jax.tree.map(lambda *leaves: np.concatenate(leaves)[rows], *parts)
+    best = chosen[:1]
+    prior = log_prior_density(targets, 0 * best, best, champion[best])
+    least = found[0].log_evidence - value[best] + prior
+    offset = np.full(source.shape, least)
+    offset[chosen] = [levels.offset for levels in found]
+    offset = np.where(np.isfinite(offset), offset, -1e30)
+    whole = np.repeat(each, num_levels)
+    levelled = _rowed(targets, whole, noise, filtered)
+    targets = eqx.tree_at(
+        lambda t: (t.structures, t.log_prior),
+        levelled,
+        (targets.structures, targets.log_prior),
+    )
+    targets = _with_offset(targets, offset.reshape(-1))
+    targets, whole = _with_coordinate(targets, champion[whole], num_levels)
+    return Levelled(targets, whole, noise, filtered)
+
+
+def evenly_levelled(
+    targets: StructureTarget,
+    champion: np.ndarray,
+    noise: NoiseFit,
+    filtered: Filtered,
+    num_levels: int,
+) -> Levelled:
+    """Levels that are all the same, for a belief without a row.
+
+    Args:
+        targets: one object.
+        champion: hypothesis of each structure.
+        noise: of each structure.
+        filtered: of each structure.
+        num_levels: of each structure.
+    """
+    num = len(champion)
+    rows = np.repeat(np.arange(num), num_levels)
+    likelihood: Any = targets.log_likelihood
+    dtype = targets.log_prior.dtype
+    targets = eqx.tree_at(
+        lambda t: (t.log_likelihood.gains, t.log_likelihood.reference),
+        targets,
+        jax.tree.map(
+            lambda leaf: on_device(np.asarray(leaf)[:, rows], dtype),
+            (likelihood.gains, likelihood.reference),
+        ),
+    )
+    targets = _with_offset(targets, np.zeros(len(rows)))
+    whole = champion[rows]
+    if num_levels > 1:
+        targets, whole = _with_coordinate(targets, whole, num_levels)
+    filtered = jax.tree.map(lambda leaf: leaf[rows], filtered)
+    return Levelled(targets, whole, noise.take(rows), filtered)
+
+
+def without_levels(target: StructureTarget) -> StructureTarget:
+    """The same without the coordinate that says which level a hypothesis has.
+
+    Args:
+        target: of one object. Its likelihood keeps its levels, and is of no more use.
+    """
+    likelihood: Any = target.log_likelihood
+    if likelihood.reference.shape[0] == target.num_structures:
+        return target
+    return eqx.tree_at(
+        lambda t: (t.slot, t.period), target, (target.slot[:-1], target.period[:-1])
+    )
+
+
+def _with_offset(targets: StructureTarget, offset: np.ndarray) -> StructureTarget:
+    return eqx.tree_at(
+        lambda t: t.log_likelihood.offset,
+        targets,
+        on_device(offset[None], targets.log_prior.dtype),
+        is_leaf=lambda leaf: leaf is None,
+    )
+
+
+def _with_coordinate(
+    targets: StructureTarget, champion: np.ndarray, num_levels: int
+) -> tuple[StructureTarget, np.ndarray]:
+    """With the coordinate that says which level a hypothesis has."""
+    slot, period = np.asarray(targets.slot), np.asarray(targets.period)
+    end = ((0, 0), (0, 1))
+    targets = eqx.tree_at(
+        lambda t: (t.slot, t.period),
+        targets,
+        (
+            on_device(np.pad(slot, end, constant_values=-1), slot.dtype),
+            on_device(np.pad(period, end, constant_values=1.0), period.dtype),
+        ),
+    )
+    level = (np.arange(len(champion)) % num_levels + 0.5) / num_levels - 0.5
+    return targets, np.concatenate([champion, level[:, None]], axis=1)
+
+
+@QuickCompile
+def mixtures_over_levels(
+    targets: StructureTarget, mixtures: LaplaceMixture
+) -> LaplaceMixture:
+    """Mixtures made for a target without levels; levels are drawn evenly.
+
+    Args:
+        targets: with levels, stacked along a leading object axis.
+        mixtures: one of each object.
+    """
+    if mixtures.mean.shape[-1] == targets.slot.shape[-1]:
+        return mixtures
+
+    def one(target: StructureTarget, mixture: LaplaceMixture) -> LaplaceMixture:
+        corner = jnp.zeros_like(mixture.scale_tril, shape=(target.dim, target.dim))
+        corner = corner.at[-1, -1].set(1.0)
+        end = ((0, 0), (0, 1))
+        return make_mixture(
+            target,
+            mixture.structure,
+            jnp.pad(mixture.mean, end),
+            jnp.pad(mixture.scale_tril, (*end, (0, 1))) + corner[None],
+            mixture.log_weight,
+            from_prior=jnp.pad(mixture.from_prior, end, constant_values=True),
+            degrees_of_freedom=mixture.degrees_of_freedom,
+        )
+
+    return jax.vmap(one)(targets, mixtures)
+
+
+class _Chosen(NamedTuple):
+    """Levels of one structure."""
+
+    noise: NoiseFit
+    filtered: Filtered
+    offset: np.ndarray
+    log_evidence: float
+    """Of the noise at the structure's best fit."""
+
+
+def _choose(
+    rng: np.random.Generator,
+    typical: TypicalNoise,
+    place: int,
+    champion: np.ndarray,
+    precision: np.ndarray,
+    num_levels: int,
+) -> _Chosen:
+    """Choose levels of a structure from draws of its noise.
+
+    How much each noise leaves open is worked out for some, which are drawn by the root
+    of their weights to reach beyond what is likely at the best fit; from those it is
+    told for all by regression. Levels are then drawn in order of it, systematically.
+    """
+    targets = typical.found.targets
+    k = int(typical.chosen[place])
+    vector, log_weight, log_evidence = _draws(rng, typical, place, champion)
+
+    def filters(rows: np.ndarray) -> tuple[NoiseFit, Filtered, StructureTarget]:
+        each, noise = np.full(len(rows), k), NoiseFit.of_vector(vector[rows])
+        z = np.tile(champion, (len(rows), 1))
+        filtered = filter_points(targets, 0 * each, each, z, noise)
+        return noise, filtered, _rowed(targets, each, noise, filtered)
+
+    tries = systematic(rng, np.exp(0.5 * log_weight), _NUM_TRIES)
+    volume = _volume(filters(tries)[2], champion, precision)
+    middle, spread = vector[tries].mean(axis=0), vector[tries].std(axis=0) + 1e-6
+    design = np.pad((vector - middle) / spread, ((0, 0), (1, 0)), constant_values=1.0)
+    normal = design[tries].T @ design[tries] + _RIDGE * np.eye(design.shape[1])
+    slope = np.linalg.solve(normal, design[tries].T @ volume)
+    told = np.clip(design @ slope, volume.min(), volume.max())
+    log_share = log_weight + _TILT * told
+    log_share = log_share - np.logaddexp.reduce(log_share)
+    order = np.argsort(told)
+    rows = order[systematic(rng, np.exp(log_share[order]), num_levels)]
+    noise, filtered, rowed = filters(rows)
+    offset = log_evidence + log_weight[rows] - log_share[rows]
+    offset = offset - _log_likelihood(rowed, champion)
+    return _Chosen(noise, filtered, offset, log_evidence)
+
+
+def _draws(
+    rng: np.random.Generator, typical: TypicalNoise, place: int, champion: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Noises of a structure at its best fit, their log-weights and their evidence."""
+    group = np.full(_NUM_DRAWS, place)
+    vector = typical.proposal.sample(rng, group)
+    k, none = typical.chosen[[place]], np.zeros(1, int)
+    fits = Fits(none, k, champion[None], np.zeros(1), np.zeros((1, 0, 0)))
+    log_weight = NoiseDensity(typical.found.targets, fits)(none, vector[None])[0]
+    log_weight = log_weight - typical.proposal.log_density(vector, group)
+    log_weight = np.where(np.isfinite(log_weight), log_weight, -1e30)
+    total = float(np.logaddexp.reduce(log_weight))
+    return vector, log_weight - total, total - math.log(_NUM_DRAWS)
+
+
+def _rowed(
+    targets: StructureTarget, structure: np.ndarray, noise: NoiseFit, filtered: Filtered
+) -> StructureTarget:
+    """A target in which each of a list of filters counts as a structure of its own."""
+    dtype = targets.log_prior.dtype
+    return eqx.tree_at(
+        lambda t: (
+            t.structures,
+            t.log_prior,
+            t.log_likelihood.gains,
+            t.log_likelihood.reference,
+        ),
+        targets,
+        (
+            on_device(np.asarray(targets.structures)[:, structure], bool),
+            on_device(np.asarray(targets.log_prior)[:, structure], dtype),
+            jax.tree.map(lambda leaf: on_device(leaf[None], dtype), filtered.gains),
+            on_device(noise.reading[None], dtype),
+        ),
+    )
+
+
+def _volume(
+    rowed: StructureTarget, champion: np.ndarray, precision: np.ndarray
+) -> np.ndarray:
+    """By how much a structure's evidence exceeds its density at a champion, by rows.
+
+    Args:
+        rowed: filters of one structure.
+        champion: of the structure.
+        precision: about it, of some gains.
+    """
+    rows = np.arange(rowed.structures.shape[1])
+    none, z = 0 * rows, np.tile(champion, (len(rows), 1))
+    fits = Fits(none, rows, z, 0.0 * none, np.tile(precision, (len(rows), 1, 1)))
+    gradient, matrix = normal_equations(rowed, Host.of(rowed), fits)
+    step = np.linalg.solve(matrix, gradient[..., None])[..., 0]
+    gain = 0.5 * np.sum(step * gradient, axis=1)
+    return np.nan_to_num(gain - 0.5 * np.linalg.slogdet(matrix)[1])
+
+
+def _log_likelihood(rowed: StructureTarget, champion: np.ndarray) -> np.ndarray:
+    """Of a champion by all filters of one structure."""
+    rows = np.arange(rowed.structures.shape[1])
+    none, z = 0 * rows, np.tile(champion, (len(rows), 1))
+    found = evaluate_points(rowed, none, rows, z).log_density
+    return found - log_prior_density(rowed, none, rows, z)
