@@ -97,6 +97,7 @@ class OnlineBelief:
         dt: float | None = None,
         has_varying_dt: bool = False,
         change_rate: float = 1.0 / 256.0,
+        num_noise_levels: int = 1,
         screen: History | None = None,
     ):
         """Set up.
@@ -112,6 +113,10 @@ class OnlineBelief:
                 costs a little more.
             change_rate: prior probability per transition that the world changes, for
                 the test that a surprise leads to.
+            num_noise_levels: of each structure of a lone body, over which its noise is
+                averaged; with one it is taken for what the last refit found, and the
+                belief comes out too narrow where much depends on it. Eight make steps
+                and refits half as slow again.
             screen: readings of all bodies; pairs that they show to move apart are
                 never tied (see `independent_blocks`).
 
@@ -131,6 +136,10 @@ class OnlineBelief:
             raise ValueError(f"forgetting: expected in (0, 1], got {forgetting}")
         if not 0.0 < change_rate < 1.0:
             raise ValueError(f"change_rate: expected in (0, 1), got {change_rate}")
+        if num_noise_levels < 1:
+            raise ValueError(
+                f"num_noise_levels: expected at least 1, got {num_noise_levels}"
+            )
         if dt is not None and not 0 < dt < np.inf:
             raise ValueError(f"dt: expected positive seconds, got {dt}")
         if "actuator.delay" in spec.unknown_numbers:
@@ -146,6 +155,7 @@ class OnlineBelief:
             is_uniform=not has_varying_dt,
             forgetting=float(forgetting),
             change_rate=float(change_rate),
+            num_levels=int(num_noise_levels),
         )
         none = np.zeros((0, spec.num_bodies, 6))
         history = make_history(none, none[..., :3], none, self._dt, capacity=capacity)

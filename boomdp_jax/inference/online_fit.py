@@ -41,9 +41,6 @@ from boomdp_jax.physics.scene_spec import SceneSpec
 FIRST_TEST = 4
 """A change is looked for when so many rows have come since readings grew odd."""
 
-# Levels of noise of each structure of a lone body. More bodies at once have one level:
-# gains grow with the square of their number, and filters with its cube.
-_NUM_LEVELS = 8
 # Rows are fitted from what is known where they are not so many times those fitted
 # before, and where no body went that much farther, in terms of what anchors of pins are
 # scaled by.
@@ -69,6 +66,8 @@ class RefitSettings(NamedTuple):
     forgetting: float
     change_rate: float
     """Prior probability that the world changes, per transition."""
+    num_levels: int = 1
+    """Of the noise of each structure of a lone body (`noise_levels`)."""
     fit: FitSettings = FitSettings()
 
 
@@ -145,14 +144,14 @@ class Fitter:
         is_near = known is not None
         typical = typical_noise(rng, found, settings.fit, is_near=is_near)
         found = typical.found
-        levelled = with_levels(rng, typical, num_levels_for(self._bodies))
+        levelled = with_levels(rng, typical, num_levels_for(settings, self._bodies))
         mixtures = start_mixtures(found.targets, found.modes)
         num, capacity = settings.num_particles, self._history.capacity
         belief = assemble_belief(levelled, mixtures, num, begin, end, capacity)
         log_proposal = belief.particles.log_weight
         if known is not None:
             z = np.array(known.particles.z)
-            if num_levels_for(self._bodies) > 1:
+            if num_levels_for(settings, self._bodies) > 1:
                 # Levels are others now; one that was narrow may have become wide.
                 z[:, -1] = rng.random(len(z)) - 0.5
             particles = eqx.tree_at(
@@ -174,9 +173,13 @@ class Fitter:
         )
 
 
-def num_levels_for(bodies: tuple[int, ...]) -> int:
-    """Levels of noise of each structure of a block."""
-    return _NUM_LEVELS if len(bodies) == 1 else 1
+def num_levels_for(settings: RefitSettings, bodies: tuple[int, ...]) -> int:
+    """Levels of noise of each structure of a block.
+
+    Of more bodies at once one level: gains grow with the square of their number, and
+    filters with its cube.
+    """
+    return settings.num_levels if len(bodies) == 1 else 1
 
 
 def _is_alike(belief: BlockBelief, block: Block, num_rows: int) -> bool:

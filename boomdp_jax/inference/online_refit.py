@@ -117,7 +117,7 @@ def prior_belief(key: Key, settings: RefitSettings, block: Block) -> BlockBelief
     each, champion = np.arange(num_structures), np.zeros((num_structures, dim))
     filtered = filter_points(targets, 0 * each, each, champion, noise)
     levelled = evenly_levelled(
-        targets, champion, noise, filtered, num_levels_for(bodies)
+        targets, champion, noise, filtered, num_levels_for(settings, bodies)
     )
     mixtures = start_mixtures(targets, modes)
     target = jax.tree.map(lambda leaf: leaf[0], levelled.targets)

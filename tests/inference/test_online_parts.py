@@ -254,6 +254,7 @@ def test_the_watch_adds_up_from_where_readings_grew_odd():
     [
         ({"capacity": 4}, "capacity: expected at least 8, got 4"),
         ({"num_particles": 100}, "num_particles: expected a multiple of 16, got 100"),
+        ({"num_noise_levels": 0}, "num_noise_levels: expected at least 1, got 0"),
         ({"forgetting": 0.0}, "forgetting: expected in"),
         ({"change_rate": 1.0}, "change_rate: expected in"),
         ({"dt": -1.0}, "dt: expected positive seconds, got -1.0"),
