@@ -173,7 +173,9 @@ class NamoPlanner:
         here, cell = self.region_at(labels, robot)
         if here == 0:
             # It is wedged in; where it stands is a region by itself.
-            cell, here = self.space.grid.cell(robot), int(labels.max()) + 1
+            inside = self.space.open
+            cell = self.cells_of(np.asarray(robot, float)[None], inside)[0][0]
+            here = int(labels.max()) + 1
             labels, free = labels.copy(), free.copy()
             labels[tuple(cell)], free[tuple(cell)] = here, True
         # Where a thing stands on the goal, that is a region by itself.
@@ -289,7 +291,7 @@ class NamoPlanner:
         cells, is_there = self.cells_of(sites, labels == site.start)
         outline = self.room.things[thing].outline
         gap = distance_to(robot, outline, poses[thing]) - self.room.robot.radius
-        if site.start == here and 0.0 < gap < REACH:
+        if site.start == here and gap < REACH:
             # It may hold the thing where it stands.
             sites = np.concatenate([sites, robot[None]])
             cells = np.concatenate([cells, [ways.start]])
