@@ -156,3 +156,18 @@ def test_fifth_example_runs_agents_and_goes_on(tmp_path):
     assert returns["true"] > returns["lwr"]
     assert_is_picture(tmp_path / "curves.png")
     assert (tmp_path / "cart-true.gif").read_bytes().startswith(b"GIF8")
+
+
+@pytest.mark.slow
+def test_ninth_example_tells_the_story_of_the_table(tmp_path):
+    done = run_example("09_namo.py", "--quick", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    # The table is tried first, does not open the way, and is known for what it is.
+    assert lines[0].startswith("table: ")
+    assert "did not open the way" in lines[0]
+    assert "'revolute'" in lines[0]
+    assert any(line.startswith("couch: ") for line in lines)
+    assert any(line.startswith("goal reached: True") for line in lines)
+    assert_is_picture(tmp_path / "namo.png")
+    assert (tmp_path / "namo.gif").stat().st_size > 10_000

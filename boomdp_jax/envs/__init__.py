@@ -49,7 +49,11 @@ from boomdp_jax.envs.namo_room import Robot as Robot
 from boomdp_jax.envs.namo_room import Room as Room
 from boomdp_jax.envs.namo_room import Thing as Thing
 from boomdp_jax.envs.namo_room import check_room as check_room
+from boomdp_jax.envs.namo_room import room_params as room_params
 from boomdp_jax.envs.namo_room import room_scene as room_scene
+from boomdp_jax.envs.namo_rooms import is_solvable as is_solvable
+from boomdp_jax.envs.namo_rooms import random_room as random_room
+from boomdp_jax.envs.namo_rooms import story_room as story_room
 from boomdp_jax.envs.pendulum import Pendulum as Pendulum
 from boomdp_jax.envs.walls import Walls as Walls
 from boomdp_jax.envs.walls import stopped_at_walls as stopped_at_walls
@@ -99,15 +103,19 @@ __all__ = [
     "grasped",
     "grasping_step",
     "is_at_goal",
+    "is_solvable",
     "join_actions",
     "make_world",
     "namo_step",
     "open_grasp",
     "pose_table",
     "pushing",
+    "random_room",
+    "room_params",
     "room_scene",
     "stopped_at_walls",
     "stopped_by_boxes",
+    "story_room",
     "take_hold",
     "walls_between",
     "way_to",
