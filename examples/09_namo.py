@@ -70,7 +70,8 @@ for ax, (title, (poses, index, params)) in zip(axes, moments.items(), strict=Tru
     place = poses[: index + 1 if index >= 0 else None, room.num_things, :2]
     ax.plot(*place.T, color="#0072B2", linewidth=1.0)
     ax.plot(*room.goal, marker="*", markersize=14, color="#D55E00")
-    ax.set(title=title, aspect="equal", xlim=(-0.3, 8.3), ylim=(-0.3, 6.3))
+    ax.set(title=title, xlim=(-0.3, 8.3), ylim=(-0.3, 6.3))
+    ax.set_aspect("equal", adjustable="box")
     ax.set_axis_off()
 
 # What it believed of the table, before and after.

@@ -17,7 +17,6 @@ pays for itself. How agents differ is in `Character`.
 """
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -31,6 +30,7 @@ from boomdp_jax.agents.manipulation import (
     grasp_sites,
     ground_of,
 )
+from boomdp_jax.agents.namo_sites import Site, on_the_way
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.envs.free_space import FreeSpace, distance_to, pose_table
 from boomdp_jax.envs.namo import REACH
@@ -111,14 +111,6 @@ class Choice(NamedTuple):
     """All that were weighed, from the robot's own region."""
 
 
-class _Site(NamedTuple):
-    """A pair of regions and the thing between them."""
-
-    thing: int
-    start: int
-    end: int
-
-
 class NamoPlanner:
     """Plans of one robot in one room; remembers what has not changed."""
 
@@ -187,7 +179,7 @@ class NamoPlanner:
         if here in (0, goal) or not self.character.moves_things:
             return nothing
         found, places, grounds = [], {}, {}
-        for site in _on_the_way(self._sites(poses, labels, here), here, goal):
+        for site in on_the_way(self._sites(poses, labels, here), here, goal):
             if site.thing in avoided:
                 continue
             trial, place, ground = self._trial(
@@ -251,7 +243,7 @@ class NamoPlanner:
         )
         return found.probability, found.action
 
-    def _sites(self, poses: np.ndarray, labels: np.ndarray, here: int) -> list[_Site]:
+    def _sites(self, poses: np.ndarray, labels: np.ndarray, here: int) -> list[Site]:
         """Things that alone keep two regions apart, both ways."""
         sizes = np.bincount(labels.reshape(-1))
         # However small they are, the robot is in one of them and has to get to one.
@@ -265,9 +257,9 @@ class NamoPlanner:
                 parts = np.unique(labels[joined == region])
                 parts = [p for p in parts if p > 0 and sizes[p] >= _LEAST_REGION]
                 if region == at_goal and not labels[tuple(self.goal_cell)]:
-                    found += [_Site(thing, int(one), COVERED) for one in parts]
+                    found += [Site(thing, int(one), COVERED) for one in parts]
                 found += [
-                    _Site(thing, int(one), int(other))
+                    Site(thing, int(one), int(other))
                     for one in parts
                     for other in parts
                     if one != other
@@ -281,7 +273,7 @@ class NamoPlanner:
         labels: np.ndarray,
         ways: Ways,
         here: int,
-        site: _Site,
+        site: Site,
         robot: np.ndarray,
     ) -> tuple[Trial | None, tuple[np.ndarray, np.ndarray], Ground | None]:
         """What a thing promises between two regions; its best and nearest grasp."""
@@ -360,7 +352,7 @@ class NamoPlanner:
         return inside[near], least < self.space.grid.spacing
 
     def _ground(
-        self, thing: int, poses: np.ndarray, labels: np.ndarray, site: _Site
+        self, thing: int, poses: np.ndarray, labels: np.ndarray, site: Site
     ) -> Ground:
         """Maps for moving a thing; the same object as long as nothing else moved."""
         others = np.delete(np.round(poses / 0.02).astype(int), thing, axis=0)
@@ -385,28 +377,3 @@ class NamoPlanner:
 
 def _first_cell(cells: np.ndarray) -> int:
     return int(np.argmax(cells))
-
-
-def _on_the_way(sites: Sequence[_Site], here: int, goal: int) -> list[_Site]:
-    """Those on ways to the goal with at most one region more than the shortest."""
-    ahead = _hops([(s.start, s.end) for s in sites], here)
-    back = _hops([(s.end, s.start) for s in sites], goal)
-    least = ahead.get(goal, math.inf)
-    return [
-        site
-        for site in sites
-        if ahead.get(site.start, math.inf) + 1 + back.get(site.end, math.inf)
-        <= least + 1
-        and site.start != goal
-        and site.end != here
-    ]
-
-
-def _hops(edges: Sequence[tuple[int, int]], start: int) -> dict[int, int]:
-    """Fewest edges from a region to each other."""
-    found, rim = {start: 0}, [start]
-    while rim:
-        level = 1 + found[rim[0]]
-        rim = sorted({b for a, b in edges if a in rim and b not in found})
-        found |= dict.fromkeys(rim, level)
-    return found

@@ -30,7 +30,7 @@ from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.compile_ahead import signature
 from boomdp_jax.inference.components import independent_blocks
 from boomdp_jax.inference.infer import check_history
-from boomdp_jax.inference.online_fit import RefitSettings, make_online_block
+from boomdp_jax.inference.online_fit import make_online_block, refit_settings
 from boomdp_jax.inference.online_posterior import (
     best_params,
     online_params,
@@ -56,7 +56,6 @@ _FIRST_REFIT, _GROWN = 8, 0.5
 # A refit for lack of particles in effect comes no sooner than so many transitions after
 # the last, and after this share of the table has been renewed.
 _REST, _RENEWED = 4, 0.25
-_MULTIPLE = 16
 
 
 class Observed(NamedTuple):
@@ -127,35 +126,17 @@ class OnlineBelief:
             raise ValueError(
                 f"capacity: expected at least {LEAVING_SHARE}, got {capacity}"
             )
-        if num_particles < _MULTIPLE or num_particles % _MULTIPLE:
-            raise ValueError(
-                f"num_particles: expected a multiple of {_MULTIPLE}, got "
-                f"{num_particles}"
-            )
-        if not 0.0 < forgetting <= 1.0:
-            raise ValueError(f"forgetting: expected in (0, 1], got {forgetting}")
-        if not 0.0 < change_rate < 1.0:
-            raise ValueError(f"change_rate: expected in (0, 1), got {change_rate}")
-        if num_noise_levels < 1:
-            raise ValueError(
-                f"num_noise_levels: expected at least 1, got {num_noise_levels}"
-            )
         if dt is not None and not 0 < dt < np.inf:
             raise ValueError(f"dt: expected positive seconds, got {dt}")
-        if "actuator.delay" in spec.unknown_numbers:
-            raise ValueError(
-                f"{spec.source}: unknown.actuator: expected no delay in an online "
-                "belief, which keeps no commands from before a step; got one"
-            )
         self.spec, self.capacity = spec, capacity
         self._dt = float(spec.dt if dt is None else dt)
-        self._settings = RefitSettings(
-            spec=spec,
+        self._settings = refit_settings(
+            spec,
             num_particles=num_particles,
             is_uniform=not has_varying_dt,
-            forgetting=float(forgetting),
-            change_rate=float(change_rate),
-            num_levels=int(num_noise_levels),
+            forgetting=forgetting,
+            change_rate=change_rate,
+            num_levels=num_noise_levels,
         )
         none = np.zeros((0, spec.num_bodies, 6))
         history = make_history(none, none[..., :3], none, self._dt, capacity=capacity)

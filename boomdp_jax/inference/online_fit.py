@@ -45,6 +45,7 @@ FIRST_TEST = 4
 # before, and where no body went that much farther, in terms of what anchors of pins are
 # scaled by.
 _GROWN, _FARTHER = 2.0, 1.0
+_MULTIPLE = 16
 # Particles that a fit may start from.
 _NUM_KNOWN = 128
 
@@ -69,6 +70,46 @@ class RefitSettings(NamedTuple):
     num_levels: int = 1
     """Of the noise of each structure of a lone body (`noise_levels`)."""
     fit: FitSettings = FitSettings()
+
+
+def refit_settings(
+    spec: SceneSpec,
+    *,
+    num_particles: int,
+    is_uniform: bool,
+    forgetting: float,
+    change_rate: float,
+    num_levels: int,
+) -> RefitSettings:
+    """Settings, checked; arguments as of `OnlineBelief`.
+
+    Raises:
+        ValueError: a number out of range, or a scene of which nothing can be learnt
+            step by step.
+    """
+    if num_particles < _MULTIPLE or num_particles % _MULTIPLE:
+        raise ValueError(
+            f"num_particles: expected a multiple of {_MULTIPLE}, got {num_particles}"
+        )
+    if not 0.0 < forgetting <= 1.0:
+        raise ValueError(f"forgetting: expected in (0, 1], got {forgetting}")
+    if not 0.0 < change_rate < 1.0:
+        raise ValueError(f"change_rate: expected in (0, 1), got {change_rate}")
+    if num_levels < 1:
+        raise ValueError(f"num_noise_levels: expected at least 1, got {num_levels}")
+    if "actuator.delay" in spec.unknown_numbers:
+        raise ValueError(
+            f"{spec.source}: unknown.actuator: expected no delay in an online belief, "
+            "which keeps no commands from before a step; got one"
+        )
+    return RefitSettings(
+        spec=spec,
+        num_particles=num_particles,
+        is_uniform=is_uniform,
+        forgetting=float(forgetting),
+        change_rate=float(change_rate),
+        num_levels=int(num_levels),
+    )
 
 
 def make_online_block(
