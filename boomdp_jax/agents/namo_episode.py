@@ -40,8 +40,6 @@ LONGEST = 150.0
 """Seconds of simulated time after which an episode is over."""
 _MOST_PUSHES = 16
 """Of one attempt."""
-_LEAST_HOPE = 0.05
-"""Probability below which an attempt is broken off."""
 _STUCK = 3
 """Pushes in a row that move nothing, after which an attempt is broken off."""
 _STIR = 0.03
@@ -208,8 +206,9 @@ class _Episode:
                 self.split(), choice, self.read, self.robot
             )
             self.seconds.append(time.perf_counter() - begin)
+            # Without a hypothesis left under which the way opens, it is broken off.
             is_stuck = num_still >= _STUCK
-            if self.is_over or (num > 0 and (hope < _LEAST_HOPE or is_stuck)):
+            if self.is_over or (num > 0 and (hope <= 0.0 or is_stuck)):
                 return num, False
             before = np.asarray(self.read.pose, float)[trial.thing]
             driven = self.carry_out(pushing(jnp.asarray(action, float)))
