@@ -96,7 +96,7 @@ class OnlineBelief:
         dt: float | None = None,
         has_varying_dt: bool = False,
         change_rate: float = 1.0 / 256.0,
-        num_noise_levels: int = 1,
+        num_noise_levels: int = 8,
         screen: History | None = None,
     ):
         """Set up.
@@ -113,9 +113,9 @@ class OnlineBelief:
             change_rate: prior probability per transition that the world changes, for
                 the test that a surprise leads to.
             num_noise_levels: of each structure of a lone body, over which its noise is
-                averaged; with one it is taken for what the last refit found, and the
-                belief comes out too narrow where much depends on it. Eight make steps
-                and refits half as slow again.
+                averaged. With one, noise is taken for what the last refit found: steps
+                and refits take two thirds of the time, and the belief comes out too
+                narrow where much depends on the noise.
             screen: readings of all bodies; pairs that they show to move apart are
                 never tied (see `independent_blocks`).
 

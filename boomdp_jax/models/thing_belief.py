@@ -56,7 +56,11 @@ class ThingModel:
         self.spec = spec
         self.scene: Scene = spec.scene
         self.online = OnlineBelief(
-            spec, capacity=_CAPACITY, num_particles=_NUM_PARTICLES
+            spec,
+            capacity=_CAPACITY,
+            num_particles=_NUM_PARTICLES,
+            # Whether a push opens a way hardly depends on how well a mass is known.
+            num_noise_levels=1,
         )
 
     def init(self, key: Key) -> ThingLearnt:
