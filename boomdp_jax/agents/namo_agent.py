@@ -282,7 +282,8 @@ class NamoPlanner:
         sites = grasp_sites(self.space, thing, poses[thing])
         cells, is_there = self.cells_of(sites, labels == site.start)
         outline = self.room.things[thing].outline
-        gap = distance_to(robot, outline, poses[thing]) - self.room.robot.radius
+        away = float(distance_to(robot[None], outline, poses[thing])[0])
+        gap = away - self.room.robot.radius
         if site.start == here and gap < REACH:
             # It may hold the thing where it stands.
             sites = np.concatenate([sites, robot[None]])
