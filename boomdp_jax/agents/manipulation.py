@@ -11,6 +11,7 @@ where it holds it.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -27,7 +28,7 @@ from boomdp_jax.models.known_kinds import pinned_where_it_is
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
-from boomdp_jax.physics.step import step
+from boomdp_jax.physics.step import prepare_step
 from boomdp_jax.planning.belief import Belief
 from boomdp_jax.planning.sparse_sampling import sparse_sampling
 
@@ -230,9 +231,10 @@ def _robot_fits(ground: Ground, place: Float[Array, "2"]) -> Array:
 class _Hypothesis(NamedTuple):
     """What a tree is told, the same for all of a plan but Φ."""
 
-    params: Params
-    """Loaded."""
-    scene: Scene
+    advance: Callable
+    """One step of the thing, with the robot's mass on it."""
+    dt: Array
+    """Of a step [s]."""
     ground: Ground
     offset: Array
     """Of the robot's middle, in the thing's frame."""
@@ -244,7 +246,7 @@ def _transition(key, hypothesis: _Hypothesis, state: State, drive):
     arm = _arm(hypothesis, state)
     moment = drive[2] + arm[0] * drive[1] - arm[1] * drive[0]
     wrench = jnp.stack([drive[0], drive[1], moment])[None]
-    moved = step(hypothesis.scene, hypothesis.params, state, wrench)[0]
+    moved = hypothesis.advance(state, wrench)[0]
     pose = moved.pose[0]
     blocked, ahead = looked_up(hypothesis.ground, pose)
     fits = _robot_fits(hypothesis.ground, pose[:2] + _arm(hypothesis, moved))
@@ -263,7 +265,7 @@ def _arm(hypothesis: _Hypothesis, state: State):
 def _reward(hypothesis: _Hypothesis, state, drive, next_state):
     del state, next_state
     share = jnp.sqrt(jnp.sum(drive[:2] ** 2)) / hypothesis.force
-    return -hypothesis.scene.dt * (1.0 + share)
+    return -hypothesis.dt * (1.0 + share)
 
 
 def _leaf(hypothesis: _Hypothesis, state: State):
@@ -284,16 +286,18 @@ def _planned(key, scene, ground, belief, state, place, mass, actions):
     x, y = place - pose[:2]
     offset = jnp.stack([cos * x + sin * y, cos * y - sin * x])
     force = jnp.max(jnp.sqrt(jnp.sum(actions[:, :2] ** 2, axis=-1)))
-    params = jax.vmap(lambda one: loaded(pinned_where_it_is(one, state), scene, mass))(
-        belief.hypotheses
-    )
+
+    def prepared(one: Params) -> Callable:
+        return prepare_step(scene, loaded(pinned_where_it_is(one, state), scene, mass))
+
+    advance = jax.vmap(prepared)(belief.hypotheses)
     same = jax.tree.map(
         lambda leaf: jnp.broadcast_to(leaf, (num, *leaf.shape)),
-        (scene, ground, offset, force),
+        (scene.dt, ground, offset, force),
     )
     plan = sparse_sampling(
         key,
-        Belief(_Hypothesis(params, *same), belief.log_weight),
+        Belief(_Hypothesis(advance, *same), belief.log_weight),
         state,
         transition_fn=_transition,
         reward_fn=_reward,

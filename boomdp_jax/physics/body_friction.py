@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 
 from boomdp_jax.core.one_loop import elementwise
 from boomdp_jax.physics.friction import Contact, Spin, limited
+from boomdp_jax.physics.many_bodies import is_many
 from boomdp_jax.physics.small_linear import dot3, inverse3, matvec3
 
 PerBody = Float[Array, "body lane"]
@@ -78,6 +79,13 @@ def friction_of_bodies(
     Returns:
         Nine entries and three; None where there is no friction.
     """
+    if contacts is not None and is_many(felt.turn[0].shape[0]):
+        parts = elementwise(_friction, felt, [contacts], [], is_limited)
+        total = jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0), parts)
+        if spins is None:
+            return total
+        brake = elementwise(_friction, felt, [], _parts(spins), is_limited)
+        return jax.tree.map(jnp.add, total, brake)
     points = [] if contacts is None else _parts(contacts)
     brakes = [] if spins is None else _parts(spins)
     total = None

@@ -22,6 +22,7 @@ All arrays of public functions are in lanes (`core.lanes`).
 """
 
 import functools
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +36,11 @@ from boomdp_jax.physics.body_friction import (
 )
 from boomdp_jax.physics.contact_rows import Ease
 from boomdp_jax.physics.contact_step import (
+    NUM_POINTS,
     Contacts,
+    Impulses,
+    Meetings,
+    Sweeping,
     Touch,
     moved_with,
     part_all,
@@ -43,15 +48,22 @@ from boomdp_jax.physics.contact_step import (
     sweeping,
     touching,
 )
-from boomdp_jax.physics.contact_world import each_round
 from boomdp_jax.physics.general_step import projected, velocity_problem
 from boomdp_jax.physics.joints import Rows
+from boomdp_jax.physics.many_bodies import is_many
 from boomdp_jax.physics.motion import Motion
 from boomdp_jax.physics.params import WORLD
 from boomdp_jax.physics.prepare import Prepared
 from boomdp_jax.physics.small_linear import dot3, matvec3
-from boomdp_jax.physics.velocity_search import solve_again, solve_velocity
-from boomdp_jax.physics.velocity_solve import Solved, VelocityProblem
+from boomdp_jax.physics.tournament import (
+    Rounds,
+    as_rounds,
+    each_round,
+    num_rounds,
+    num_seats,
+)
+from boomdp_jax.physics.velocity_search import solve_from
+from boomdp_jax.physics.velocity_solve import Solution, VelocityProblem, first_guess
 
 # Below this share of a free body's answer a row has nothing left to hold.
 _TINY_EASE = 1e-6
@@ -93,45 +105,106 @@ def coupled_substep(
     Returns:
         The motion at the end, and what the next substep starts with.
     """
-    num_bodies = motion.x.shape[0]
     problem = velocity_problem(prepared, motion, force)
-    sums, impulses = touch.sums, touch.impulses
-    # Under the impulses of the substep before.
-    solved = solve_velocity(_pushed(problem, sums))
-    twists = solved.solution.twist
-    ease = _ease(problem, _sure_answer(problem, twists))
-    eases = each_round(ease, num_bodies)
-    sweep, meetings = sweeping(contacts, eases, prepared.length), []
-
-    def answered(before: Solved, old: tuple, sums: tuple) -> Solved:
-        """Friction and joints under the impulses of contacts."""
-        changes = [jnp.any(p != q, axis=0) for p, q in zip(old, sums, strict=True)]
-        has_changed = functools.reduce(jnp.logical_or, changes)
-        return solve_again(_pushed(problem, sums), before.solution, has_changed)
-
     before = moved, tuple(motion[3:])
-    for _ in range(num_sweeps):
-        sweep, both, impulses, meetings = part_all(
-            sweep, before, (*twists, *sums), impulses
+    num_bodies = motion.x.shape[0]
+
+    def sweep_with(stage: _Stage) -> Sweeping:
+        return sweeping(contacts, stage.eases, prepared.length, num_bodies)
+
+    def begun(stage: _Stage) -> _Stage:
+        """Nothing but the impulses of the substep before."""
+        return stage
+
+    def eased(stage: _Stage) -> _Stage:
+        """Bodies answer to contacts as the first solve has it; the first sweep."""
+        answer = _sure_answer(problem, stage.solution.twist)
+        eases = each_round(_ease(problem, answer), num_bodies)
+        return parted(stage._replace(eases=eases))
+
+    def parted(stage: _Stage) -> _Stage:
+        """A sweep before bodies are moved."""
+        both = (*stage.solution.twist, *stage.sums)
+        _, both, impulses, meetings = part_all(
+            sweep_with(stage), before, both, stage.impulses
         )
-        solved, sums = answered(solved, sums, both[3:]), both[3:]
-        twists = solved.solution.twist
-    touches = touching(contacts, [problem.mobile / problem.mass * p for p in sums])
-    place = moved_with(motion, touches, twists, prepared.length)
-    both, impulses = settle_all(sweep, meetings, (*twists, *sums), impulses)
-    solved, sums = answered(solved, sums, both[3:]), both[3:]
-    final = Motion(*place, *solved.solution.twist)
+        return stage._replace(sums=both[3:], impulses=impulses, meetings=meetings)
+
+    def settled(stage: _Stage) -> _Stage:
+        """Bodies are moved; the last sweep."""
+        twists, sums = stage.solution.twist, stage.sums
+        touches = touching(contacts, [problem.mobile / problem.mass * p for p in sums])
+        place = moved_with(motion, touches, twists, prepared.length)
+        both = (*twists, *sums)
+        both, impulses = settle_all(
+            sweep_with(stage), stage.meetings, both, stage.impulses
+        )
+        return stage._replace(place=tuple(place), sums=both[3:], impulses=impulses)
+
+    ways = (begun, eased, parted, settled)
+
+    def advance(stage: _Stage, way) -> tuple[_Stage, None]:
+        """Contacts, then friction and joints under their impulses."""
+        is_loop = not isinstance(way, int)
+        new = jax.lax.switch(way, ways, stage) if is_loop else ways[way](stage)
+        changes = [
+            jnp.any(p != q, axis=0) for p, q in zip(stage.sums, new.sums, strict=True)
+        ]
+        is_open = functools.reduce(jnp.logical_or, changes) | (way == 0)
+        turn = jnp.minimum(way, 1)
+        solved = solve_from(_pushed(problem, new.sums), new.solution, is_open, turn)
+        return new._replace(solution=solved.solution, is_done=solved.is_settled), None
+
+    order = [0, 1, *[2] * (num_sweeps - 1), 3]
+    stage = _first_stage(problem, motion, touch)
+    if is_many(num_bodies):
+        # Sweeps and solves are compiled once.
+        stage, _ = jax.lax.scan(advance, stage, jnp.asarray(order, jnp.int32))
+    else:
+        for way in order:
+            stage, _ = advance(stage, way)
+    final = Motion(*stage.place, *stage.solution.twist)
     final = projected(
         prepared,
         problem,
-        solved.is_settled,
+        stage.is_done,
         force,
         motion,
         final,
         # Smoothed contacts push before bodies touch.
         is_closed=contacts.smoothing is None,
     )
-    return final, Touch(impulses, sums)
+    return final, Touch(stage.impulses, stage.sums)
+
+
+class _Stage(NamedTuple):
+    """What is known between a solve and the next sweep."""
+
+    solution: Solution
+    is_done: Any
+    """Whether the solve came to rest."""
+    sums: tuple
+    impulses: Impulses
+    eases: Rounds
+    meetings: Meetings
+    place: tuple
+
+
+def _first_stage(problem: VelocityProblem, motion: Motion, touch: Touch) -> _Stage:
+    """Before the first solve; what later stages fill in is blank."""
+    num_bodies, zero = motion.x.shape[0], jnp.zeros_like(motion.x)
+    eases = each_round(Ease(zero, zero, zero, (zero, zero, zero)), num_bodies)
+    shape = (num_rounds(num_bodies), num_seats(num_bodies) // 2, motion.x.shape[-1])
+    none = jnp.zeros(shape, motion.x.dtype)
+    return _Stage(
+        first_guess(problem),
+        jnp.ones(motion.x.shape[-1], bool),
+        touch.sums,
+        touch.impulses,
+        eases,
+        as_rounds([none] * NUM_POINTS, num_bodies),
+        tuple(motion[:3]),
+    )
 
 
 def _pushed(problem: VelocityProblem, sums: tuple) -> VelocityProblem:

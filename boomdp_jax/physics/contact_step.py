@@ -28,7 +28,6 @@ from boomdp_jax.physics.contact_energy import without_gain
 from boomdp_jax.physics.contact_impulses import Pace, part, settle
 from boomdp_jax.physics.contact_rows import (
     Ease,
-    Rows,
     Side,
     Start,
     add_pushes,
@@ -36,23 +35,32 @@ from boomdp_jax.physics.contact_rows import (
 )
 from boomdp_jax.physics.contact_world import ContactWorld, Fixed
 from boomdp_jax.physics.motion import Motion
-from boomdp_jax.physics.tournament import Halves, moved_on, play, seated, unseated
+from boomdp_jax.physics.tournament import (
+    Halves,
+    Rounds,
+    least,
+    moved_on,
+    num_seats,
+    play,
+    seated,
+    unseated,
+)
 from boomdp_jax.physics.trigonometry import heading_turn
 
 NUM_POINTS = 2
 """Points of a contact."""
 
-Impulses = list[list[tuple]]
+Impulses = Rounds
 """Of each round's pairs: normal and tangential, of both points; `[pair, lane]`."""
-Meetings = list[list]
+Meetings = Rounds
 """Of each round's pairs: speed at which surfaces part, at both points."""
 
 
 class Contacts(NamedTuple):
     """All contacts of a step."""
 
-    rows: list[Rows]
-    """Round by round, `[pair, lane]`."""
+    rows: Rounds
+    """`Rows`, round by round, `[pair, lane]`."""
     overlap: Float[Array, " lane"]
     """Deepest, when they were found [m]."""
     smoothing: Float[Array, " lane"] | None
@@ -117,10 +125,10 @@ def find_contacts(
         carry = moved_on(handed_on[0]), moved_on(sums)
         return carry, (start.rows, start.impulses, nearest)
 
-    own = zip(world.fixed, world.allowed, world.eases, impulses, strict=True)
-    (_, sums), found = play(turn, carry, list(own))
-    rows, kept, nearest = (list(part) for part in zip(*found, strict=True))
-    overlap = jnp.maximum(-functools.reduce(jnp.minimum, nearest), 0.0)
+    (_, sums), (rows, kept, nearest) = play(
+        turn, carry, world.fixed, world.allowed, world.eases, impulses
+    )
+    overlap = jnp.maximum(-least(nearest), 0.0)
     contacts = Contacts(rows, overlap, world.smoothing)
     return contacts, Touch(kept, unseated(sums, num_bodies))
 
@@ -141,15 +149,15 @@ def _begin(
 class Sweeping(NamedTuple):
     """What sweeps over contacts are given, and hand on (`one_loop`)."""
 
-    rows: list[Rows]
-    eases: list[Halves]
+    rows: Rounds
+    eases: Rounds
     """Of both bodies of each pair, round by round."""
     pace: Pace
     """`[pair, lane]`."""
 
 
 def sweeping(
-    contacts: Contacts, eases: list[Halves], length: Float[Array, " lane"]
+    contacts: Contacts, eases: Rounds, length: Float[Array, " lane"], num_bodies: int
 ) -> Sweeping:
     """Gather what sweeps of a substep are given.
 
@@ -157,11 +165,12 @@ def sweeping(
         contacts: of this step.
         eases: of both bodies of each pair, round by round.
         length: of the substep [s].
+        num_bodies: how many.
 
     Returns:
         All of it.
     """
-    num_pairs = contacts.rows[0].friction.shape[0]
+    num_pairs = num_seats(num_bodies) // 2
     pace = jax.tree.map(
         lambda one: jnp.broadcast_to(one[None], (num_pairs, *one.shape)),
         Pace(1.0 / length, contacts.smoothing),
@@ -196,9 +205,9 @@ def part_all(
         carry = pace, moved_on(known), moved_on(halves)
         return carry, (row, ease, new, met)
 
-    own = zip(given.rows, given.eases, impulses, strict=True)
-    (pace, _, halves), found = play(turn, carry, list(own))
-    rows, eases, after, meetings = (list(part) for part in zip(*found, strict=True))
+    (pace, _, halves), (rows, eases, after, meetings) = play(
+        turn, carry, given.rows, given.eases, impulses
+    )
     return Sweeping(rows, eases, pace), unseated(halves, num_bodies), after, meetings
 
 
@@ -224,17 +233,18 @@ def settle_all(
         pace, (halves, new) = over_pairs(
             settle, pace, row, ease, met, halves, old, num_passed=1
         )
-        return (pace, moved_on(halves)), new
+        return (pace, moved_on(halves)), (new,)
 
-    own = zip(given.rows, given.eases, meetings, impulses, strict=True)
     carry = given.pace, seated(twists, num_bodies)
-    (_, halves), after = play(turn, carry, list(own))
+    (_, halves), (after,) = play(
+        turn, carry, given.rows, given.eases, meetings, impulses
+    )
     return unseated(halves, num_bodies), after
 
 
 def contact_substep(
     contacts: Contacts,
-    eases: list[Halves],
+    eases: Rounds,
     ease: Ease,
     length: Float[Array, " lane"],
     motion: Motion,
@@ -262,7 +272,8 @@ def contact_substep(
     given = ease(touch.sums)
     start = tuple(v + dv for v, dv in zip(free, given, strict=True))
     before = moved, tuple(motion[3:])
-    sweep, meetings = sweeping(contacts, eases, length), []
+    num_bodies = motion.x.shape[0]
+    sweep, meetings = sweeping(contacts, eases, length, num_bodies), []
     twists, impulses = start, touch.impulses
     for _ in range(num_sweeps):
         sweep, twists, impulses, meetings = part_all(sweep, before, twists, impulses)

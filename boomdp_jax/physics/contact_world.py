@@ -4,7 +4,7 @@ All arrays are in lanes (`core.lanes`): `[body, lane]`, or `[pair, lane]` for on
 of the tournament of pairs.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +14,7 @@ from boomdp_jax.physics.contact_rows import Ease
 from boomdp_jax.physics.params import WORLD, Params
 from boomdp_jax.physics.prepare import Prepared
 from boomdp_jax.physics.scene import Scene
-from boomdp_jax.physics.tournament import Halves, moved_on, num_rounds, pairs, seated
+from boomdp_jax.physics.tournament import Rounds, as_rounds, each_round, pairs
 
 PerBody = Float[Array, "body lane"]
 
@@ -43,11 +43,11 @@ class ContactWorld(NamedTuple):
     """What the contacts of a world need and no step changes."""
 
     outlines: Outlines
-    fixed: list[Halves]
+    fixed: Rounds
     """`Fixed` of both bodies of each pair, round by round."""
-    allowed: list[Float[Array, "pair lane"]]
-    """One where a pair may collide, else zero, round by round."""
-    eases: list[Halves]
+    allowed: Rounds
+    """One where a pair may collide, else zero, `[pair, lane]`, round by round."""
+    eases: Rounds
     """`contact_rows.Ease` of both bodies of each pair, round by round, as if nothing
     held them."""
     smoothing: Float[Array, " lane"] | None
@@ -100,15 +100,6 @@ def contact_world(scene: Scene, params: Params, prepared: Prepared) -> ContactWo
     )
 
 
-def each_round(tree: Any, num_bodies: int) -> list[Halves]:
-    """Seats in every round."""
-    halves, rounds = seated(tree, num_bodies), []
-    for _ in range(num_rounds(num_bodies)):
-        rounds.append(halves)
-        halves = moved_on(halves)
-    return rounds
-
-
 def _may_touch(scene: Scene, params: Params, prepared: Prepared):
     """Filters, joints and immobile pairs, as zeros and ones `[body, body, lane]`."""
     collides = scene.collides
@@ -130,16 +121,11 @@ def _may_touch(scene: Scene, params: Params, prepared: Prepared):
     return allowed.astype(prepared.mass.dtype)
 
 
-def _of_pairs(table: Float[Array, "body body lane"]) -> list:
+def _of_pairs(table: Float[Array, "body body lane"]) -> Rounds:
     """Entries of each round's pairs; zero where somebody meets nobody."""
     num_bodies = table.shape[0]
-    nobody = jnp.zeros_like(table[0, 0])
-    return [
-        jnp.stack(
-            [
-                table[i, j] if max(i, j) < num_bodies else nobody
-                for i, j in zip(first.tolist(), second.tolist(), strict=True)
-            ]
-        )
-        for first, second in pairs(num_bodies)
-    ]
+    first, second = (np.stack(row) for row in zip(*pairs(num_bodies), strict=True))
+    is_met = np.maximum(first, second) < num_bodies
+    first, second = np.where(is_met, first, 0), np.where(is_met, second, 0)
+    entries = table.reshape(num_bodies**2, -1)[first * num_bodies + second]
+    return as_rounds(jnp.where(is_met[..., None], entries, 0.0), num_bodies)

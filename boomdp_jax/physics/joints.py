@@ -24,6 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.one_loop import elementwise
+from boomdp_jax.physics.many_bodies import is_many
 from boomdp_jax.physics.params import WORLD, Params
 
 PerBody = Float[Array, "body lane"]
@@ -148,6 +149,11 @@ def of_body(index: PerRow, values: Any) -> Any:
         Tree of arrays `[row, lane]`.
     """
     leaves, treedef = jax.tree.flatten(values)
+    if is_many(leaves[0].shape[0]):
+        body = jnp.arange(leaves[0].shape[0], dtype=index.dtype)
+        is_it = (index[:, None] == body[None, :, None])[None]
+        total = jnp.sum(jnp.where(is_it, jnp.stack(leaves)[:, None], 0.0), axis=2)
+        return jax.tree.unflatten(treedef, list(total))
     # Stacked, which makes one operation of each body's instead of many.
     table = jnp.stack(leaves, axis=1)
     total = jnp.zeros((len(leaves), *index.shape), table.dtype)

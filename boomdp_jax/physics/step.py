@@ -50,6 +50,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from boomdp_jax.physics.actuator import applied, without_actuator
@@ -120,11 +121,15 @@ def prepare_step(
 
     Returns:
         A function from state and wrench `[body, 3]` to the next state and what there
-        is to report; the same as `step`.
+        is to report; the same as `step`. It is a pytree of what was worked out, so
+        that it may be batched by `vmap` and given to compiled functions.
     """
     length = jnp.asarray(scene.dt if dt is None else dt, scene.area.dtype)
-    advance = _step_of(scene, params, length)
-    return lambda state, wrench: advance(state, wrench, None)
+    return Partial(_without_cache, _step_of(scene, params, length))
+
+
+def _without_cache(advance: Callable, state: State, wrench: Array) -> tuple:
+    return advance(state, wrench, None)
 
 
 def rollout(
@@ -198,36 +203,39 @@ def _rollout_of_reference(
     return jax.lax.scan(one_step, (state, empty_cache(scene)), inputs)[1]
 
 
-def _step_of(scene: Scene, params: Params, length: Array) -> Callable:
+def _step_of(scene: Scene, params: Params, length: Array) -> Partial:
     """A function from state, wrench and cache, with what is constant worked out."""
     if params.actuator is not None:
-        advance_applied = _step_of(scene, without_actuator(params), length)
-        return lambda state, wrench, cache: advance_applied(
-            state, applied(params, wrench, scene.is_static), cache
-        )
+        advance = _step_of(scene, without_actuator(params), length)
+        return Partial(_step_applied, advance, scene, params)
     if params.center_of_mass is not None:
-        advance_center = _step_of(*about_center(scene, params), length)
-
-        def advance_reference(state: State, wrench, cache: Any):
-            wrench = wrench_at_center(params, state, wrench, length)
-            center = state_of_center(params, state)
-            center, info = advance_center(center, wrench, cache)
-            return state_of_reference(params, center), info
-
-        return advance_reference
+        advance = _step_of(*about_center(scene, params), length)
+        return Partial(_step_of_reference, advance, params, length)
     if not is_lone(scene, params):
-        world = prepare_step_of_world(scene, params, length)
-        return lambda state, wrench, cache: world_step(
-            scene, world, state, wrench, cache
-        )
-    body = prepare_lone(scene, params, length)
+        return Partial(world_step, scene, prepare_step_of_world(scene, params, length))
+    return Partial(_lone_step, scene, prepare_lone(scene, params, length))
 
-    def advance(state: State, wrench, cache: Any) -> tuple[State, StepInfo]:
-        del cache
-        motion, info = _lone(scene, body, motion_of(state), wrench)
-        return state_of(motion, scene.num_bodies), info
 
-    return advance
+def _step_applied(
+    advance: Callable, scene: Scene, params: Params, state: State, wrench, cache: Any
+) -> tuple[State, StepInfo]:
+    return advance(state, applied(params, wrench, scene.is_static), cache)
+
+
+def _step_of_reference(
+    advance: Callable, params: Params, length: Array, state: State, wrench, cache: Any
+) -> tuple[State, StepInfo]:
+    wrench = wrench_at_center(params, state, wrench, length)
+    center, info = advance(state_of_center(params, state), wrench, cache)
+    return state_of_reference(params, center), info
+
+
+def _lone_step(
+    scene: Scene, held: tuple, state: State, wrench, cache: Any
+) -> tuple[State, StepInfo]:
+    del cache
+    motion, info = _lone(scene, held, motion_of(state), wrench)
+    return state_of(motion, scene.num_bodies), info
 
 
 def _lone(

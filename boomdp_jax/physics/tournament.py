@@ -6,20 +6,29 @@ even number B there are B - 1 rounds of B / 2 pairs, after which all sit where t
 began. Within a round pairs have no body in common, so one operation treats them all.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-# From so many rounds on they are a loop: a step of eight bodies then compiles in half
-# the time and is faster, one of the living room's sixteen is three times as fast. Of
-# four or six bodies it is slower so.
-_MANY_ROUNDS = 7
+from boomdp_jax.physics.many_bodies import is_many
 
 Halves = tuple[Any, Any]
 """Two trees of arrays `[pair, ...]`: who sits in the first row, who opposite."""
+
+
+class Stacked(NamedTuple):
+    """All rounds of a tournament of many in one tree."""
+
+    tree: Any
+    """Arrays `[round, pair, ...]`."""
+
+
+Rounds = list | Stacked
+"""What belongs to each round: one tree of `[pair, ...]` after another, or stacked."""
 
 
 def num_seats(num_bodies: int) -> int:
@@ -98,28 +107,76 @@ def pairs(num_bodies: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
             )
 
 
+def each_round(tree: Any, num_bodies: int) -> Rounds:
+    """Who sits where in every round.
+
+    Args:
+        tree: arrays `[body, ...]` of one shape.
+        num_bodies: how many.
+
+    Returns:
+        Both rows (`Halves`) of each round.
+    """
+    if not is_many(num_bodies):
+        halves, rounds = seated(tree, num_bodies), []
+        for _ in range(num_rounds(num_bodies)):
+            rounds.append(halves)
+            halves = moved_on(halves)
+        return rounds
+    leaves, treedef = jax.tree.flatten(tree)
+    table = jnp.stack(leaves)
+    if num_bodies < num_seats(num_bodies):
+        table = jnp.concatenate([table, jnp.zeros_like(table[:, :1])], axis=1)
+    rows = (np.stack(row) for row in zip(*pairs(num_bodies), strict=True))
+    first, second = (
+        jax.tree.unflatten(treedef, list(table[:, seats])) for seats in rows
+    )
+    return Stacked((first, second))
+
+
+def as_rounds(tree: Any, num_bodies: int) -> Rounds:
+    """What belongs to each round, of arrays `[round, pair, ...]`."""
+    if is_many(num_bodies):
+        return Stacked(tree)
+    return [
+        jax.tree.map(lambda leaf, i=i: leaf[i], tree)
+        for i in range(num_rounds(num_bodies))
+    ]
+
+
+def stacked(rounds: Rounds) -> Any:
+    """What belongs to each round, as a tree of arrays `[round, pair, ...]`."""
+    if isinstance(rounds, Stacked):
+        return rounds.tree
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *rounds)
+
+
+def least(rounds: Rounds) -> Any:
+    """Smallest of all rounds, of arrays `[...]` of each."""
+    if isinstance(rounds, Stacked):
+        return jax.tree.map(lambda leaf: jnp.min(leaf, axis=0), rounds.tree)
+    return functools.reduce(lambda p, q: jax.tree.map(jnp.minimum, p, q), rounds)
+
+
 def play(
-    turn: Callable[[Any, Any], tuple[Any, Any]], carry: Any, rounds: Sequence[Any]
-) -> tuple[Any, list]:
+    turn: Callable[[Any, tuple], tuple[Any, tuple]], carry: Any, *own: Rounds
+) -> tuple[Any, tuple[Rounds, ...]]:
     """Play all rounds, one after another.
 
     Args:
-        turn: from what is carried and what belongs to a round, to what is carried on
-            and what comes of the round.
+        turn: from what is carried and all that belongs to a round, to what is carried
+            on and a tuple of what comes of the round.
         carry: to begin with.
-        rounds: what belongs to each; trees of arrays of equal shapes.
+        own: what belongs to each.
 
     Returns:
         What is carried in the end, and what came of each round.
     """
-    if len(rounds) < _MANY_ROUNDS:
-        results = []
-        for one in rounds:
-            carry, result = turn(carry, one)
-            results.append(result)
-        return carry, results
-    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *rounds)
-    carry, found = jax.lax.scan(turn, carry, together)
-    return carry, [
-        jax.tree.map(lambda leaf, i=i: leaf[i], found) for i in range(len(rounds))
-    ]
+    if all(isinstance(rounds, Stacked) for rounds in own):
+        carry, found = jax.lax.scan(turn, carry, tuple(stacked(one) for one in own))
+        return carry, tuple(Stacked(part) for part in found)
+    results = []
+    for one in zip(*own, strict=True):
+        carry, result = turn(carry, one)
+        results.append(result)
+    return carry, tuple(list(part) for part in zip(*results, strict=True))

@@ -12,6 +12,7 @@ All arrays are in lanes (`core.lanes`).
 """
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -51,25 +52,32 @@ def solve_velocity(problem: VelocityProblem) -> Solved:
     return _iterated(problem, first_guess(problem), unknown, 0)
 
 
-def solve_again(
-    problem: VelocityProblem, found: Solution, has_changed: Bool[Array, " lane"]
+def solve_from(
+    problem: VelocityProblem,
+    guess: Solution,
+    is_open: Bool[Array, " lane"],
+    turn: Any,
 ) -> Solved:
-    """Solve a velocity update of which one with other momenta has been solved.
+    """Solve a velocity update of which something is known.
 
     Args:
         problem: momenta, frictions and joint rows.
-        found: the solution with other momenta.
-        has_changed: where they differ.
+        guess: `first_guess`, or the solution with other momenta.
+        is_open: where anything is to be found; elsewhere the guess is the solution.
+        turn: zero for a first guess, else one.
 
     Returns:
         Twists and impulses.
     """
-    guess = found._replace(before=found.twist)
-    return _iterated(problem, guess, has_changed, 1)
+    x, y, spin = (
+        jnp.where(turn > 0, now, old)
+        for now, old in zip(guess.twist, guess.before, strict=True)
+    )
+    return _iterated(problem, guess._replace(before=(x, y, spin)), is_open, turn)
 
 
 def _iterated(
-    problem: VelocityProblem, guess: Solution, is_open: Bool[Array, " lane"], turn: int
+    problem: VelocityProblem, guess: Solution, is_open: Bool[Array, " lane"], turn: Any
 ) -> Solved:
     """Newton's method; in the first turn of all, everything sticks."""
     has_friction = problem.contacts is not None or problem.spins is not None

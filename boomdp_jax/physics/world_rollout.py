@@ -24,7 +24,7 @@ from boomdp_jax.physics.prepare import Prepared, prepare_world
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
 from boomdp_jax.physics.step_info import StepInfo, report
-from boomdp_jax.physics.tournament import num_rounds, num_seats
+from boomdp_jax.physics.tournament import as_rounds, num_rounds, num_seats, stacked
 
 
 class World(NamedTuple):
@@ -248,21 +248,14 @@ def _columns(array: Any) -> tuple:
 
 def _impulses(cache: Any, num_bodies: int, like: Any) -> Impulses:
     """Impulses of every round's pairs, from an array `[round, pair, 4, lane]`."""
-    num = num_seats(num_bodies) // 2
-    rounds = range(num_rounds(num_bodies))
     if cache is None:
-        zero = jnp.zeros((num, like.shape[-1]), like.dtype)
-        return [[(zero, zero)] * NUM_POINTS for _ in rounds]
-    return [
-        [(cache[r, :, 2 * p], cache[r, :, 2 * p + 1]) for p in range(NUM_POINTS)]
-        for r in rounds
-    ]
+        num, lanes = num_seats(num_bodies) // 2, like.shape[-1]
+        shape = (num_rounds(num_bodies), num, 2 * NUM_POINTS, lanes)
+        cache = jnp.zeros(shape, like.dtype)
+    points = [(cache[:, :, 2 * p], cache[:, :, 2 * p + 1]) for p in range(NUM_POINTS)]
+    return as_rounds(points, num_bodies)
 
 
 def _packed(impulses: Impulses) -> Any:
-    return jnp.stack(
-        [
-            jnp.stack([number for point in points for number in point], axis=1)
-            for points in impulses
-        ]
-    )
+    points = stacked(impulses)
+    return jnp.stack([number for point in points for number in point], axis=2)

@@ -51,6 +51,10 @@ class Shape(NamedTuple):
     is_merged: bool
     """Whether children share places at all."""
 
+    def as_merged(self) -> "Shape":
+        """Leaves as a level of which no more places are kept than it has."""
+        return self._replace(num_below=self.num_nodes, is_merged=True)
+
 
 class Record(NamedTuple):
     """What is kept of a level to back values up."""
@@ -110,11 +114,17 @@ def num_model_calls(shapes: list[Shape], problem: Problem) -> int:
 
 
 def runs_of(shapes: list[Shape]) -> list[tuple[Shape, int, int]]:
-    """Levels that are alike and follow each other: shape, first level, how many."""
+    """Levels that are alike and follow each other: shape, first level, how many.
+
+    Leaves are like the merged levels above them, so that there is one program for all:
+    what is merged of them is of no account.
+    """
     runs: list[tuple[Shape, int, int]] = []
     for level, shape in enumerate(shapes):
-        if runs and runs[-1][0] == shape and shape.num_below == shape.num_nodes:
-            runs[-1] = (shape, runs[-1][1], runs[-1][2] + 1)
+        like = shape if shape.num_below else shape.as_merged()
+        is_more = runs and runs[-1][0] == like and like.num_below == like.num_nodes
+        if is_more:
+            runs[-1] = (like, runs[-1][1], runs[-1][2] + 1)
         else:
             runs.append((shape, level, 1))
     return runs
@@ -169,14 +179,16 @@ def grow(
         score = children.nodes.path_return
         score = score + level_discount * held_discount * children.leaf
         merge_key = jax.random.fold_in(expansion_key, 0)
-        below, place, counts = _next_level(merge_key, shape, children, score, merging)
+        is_last = level == len(shapes) - 1
+        below, place, counts = _next_level(
+            merge_key, shape, children, score, merging, is_last
+        )
         axes = (shape.num_nodes, problem.num_actions, shape.num_samples)
+        # Leaves' values are paid at once: there is no level to look them up in.
         reward, continuation = children.reward, children.continuation
-        if below is None:
-            # Leaves' values are paid at once: there is no level to look them up in.
-            is_left = children.nodes.exists
-            reward = reward + jnp.where(is_left, continuation * children.leaf, 0.0)
-            continuation = jnp.zeros_like(continuation)
+        is_leaf = is_last & children.nodes.exists
+        reward = reward + jnp.where(is_leaf, continuation * children.leaf, 0.0)
+        continuation = jnp.where(is_last, 0.0, continuation)
         record = Record(
             place.reshape(axes),
             reward.reshape(axes),
@@ -202,7 +214,12 @@ def grow(
 
 
 def _next_level(
-    key: Key, shape: Shape, children: Children, score: Array, merging: Merging | None
+    key: Key,
+    shape: Shape,
+    children: Children,
+    score: Array,
+    merging: Merging | None,
+    is_last: Any,
 ):
     """Nodes of the next level, each child's place there, and how many had none."""
     exists = children.nodes.exists
@@ -212,18 +229,29 @@ def _next_level(
     if not shape.is_merged or merging is None:
         place = jnp.where(exists, jnp.arange(exists.shape[0]), -1)
         return children.nodes, place, (none, none)
-    merged = merge(
-        key,
-        jax.vmap(merging.grid.cell)(children.nodes.state),
-        jax.vmap(merging.strata.cell)(children.nodes.state),
-        score,
-        exists,
-        capacity=shape.num_below,
-        policy=merging.policy,
+
+    def next_nodes():
+        merged = merge(
+            key,
+            jax.vmap(merging.grid.cell)(children.nodes.state),
+            jax.vmap(merging.strata.cell)(children.nodes.state),
+            score,
+            exists,
+            capacity=shape.num_below,
+            policy=merging.policy,
+        )
+        nodes = jax.tree.map(lambda leaf: leaf[merged.child], children.nodes)
+        nodes = nodes._replace(exists=merged.exists)
+        return nodes, merged.place, (merged.num_merged, merged.num_dropped)
+
+    if isinstance(is_last, bool):
+        return next_nodes()
+    found = jax.eval_shape(next_nodes)
+    nodes, place, (num_merged, num_dropped) = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), found
     )
-    nodes = jax.tree.map(lambda leaf: leaf[merged.child], children.nodes)
-    nodes = nodes._replace(exists=merged.exists)
-    return nodes, merged.place, (merged.num_merged, merged.num_dropped)
+    nothing = nodes, place - 1, (num_merged, num_dropped)
+    return lax.cond(is_last, lambda: nothing, next_nodes)
 
 
 def back_up(record: Record, below: Float[Array, " below"]) -> Backed:
@@ -242,10 +270,10 @@ def back_up(record: Record, below: Float[Array, " below"]) -> Backed:
 def _back_up_all(records: list[Record], shapes: list[Shape]) -> tuple[Backed, ...]:
     """The same for all levels, from the leaves up."""
     backed = []
-    value = jnp.zeros(1, records[-1].reward.dtype)
-    for record, (_, _, count) in zip(
-        reversed(records), reversed(runs_of(shapes)), strict=True
-    ):
+    runs = runs_of(shapes)
+    # There is nothing below leaves; a loop over them has it of its own shape.
+    value = jnp.zeros(max(runs[-1][0].num_below, 1), records[-1].reward.dtype)
+    for record, (_, _, count) in zip(reversed(records), reversed(runs), strict=True):
         if count == 1:
             level = back_up(record, value)
             value = level.value
