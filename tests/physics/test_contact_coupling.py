@@ -26,12 +26,15 @@ CONSTRAINTS = (
 )
 
 
-def _room(robot_x=-1.0, table_x=0.0, door=(0.0, 5.0, 0.0), speed=0.0, density=20.0):
+def _room(
+    robot_x=-1.0, table_x=0.0, door=(0.0, 5.0, 0.0), speed=0.0, density=20.0, others=()
+):
     return spec_of(
         body("robot", 0.2, (robot_x, 0.0, 0.0), (speed, 0.0, 0.0), density=density),
         body("table", (0.3, 0.2), (table_x, 0.0, 0.0)),
         body("door", (0.4, 0.05), door),
         fixed("wall", (0.2, 2.0), (3.0, 0.0, 0.0)),
+        *others,
         constraints=CONSTRAINTS,
         **SEEN_FROM_ABOVE,
     )
@@ -133,3 +136,27 @@ def test_bodies_that_a_joint_connects_do_not_touch():
         plain, params, spec.initial_state(), jnp.zeros((60, 2, 3))
     )
     assert np.allclose(states.pose, expected.pose, atol=1e-6)
+
+
+def test_bystanders_change_nothing():
+    # Few bodies are written out, many are gone over in loops: the same world.
+    def path(spec, force):
+        state, params = spec.initial_state(), spec.params()
+        wrenches = jnp.zeros((40, *state.pose.shape)).at[:, 0, 0].set(force)
+        after, _ = rollout(spec.scene, params, state, wrenches)
+        return after.pose[-1, 1, 0], after.array[-1, :3]
+
+    away = [
+        body(f"bystander_{i}", (0.3, 0.2), (10.0 + 2.0 * i, 10.0, 0.3))
+        for i in range(4)
+    ]
+    few, many = _room(robot_x=-0.5), _room(robot_x=-0.5, others=away)
+    alone = jax.jit(lambda force: path(few, force))
+    (_, after), (low, _), (high, _) = (
+        alone(jnp.asarray(force)) for force in (20.0, 19.5, 20.5)
+    )
+    assert after[1, 0] > 0.2
+    among = jax.jit(jax.value_and_grad(lambda f: path(many, f), has_aux=True))
+    (_, other), slope = among(jnp.asarray(20.0))
+    np.testing.assert_allclose(other, after, rtol=1e-4, atol=1e-5)
+    assert slope == pytest.approx(float(high - low), rel=0.02)
