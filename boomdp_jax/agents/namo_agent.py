@@ -150,6 +150,7 @@ class NamoPlanner:
         state: State,
         robot: Float[np.ndarray, "2"],
         avoided: frozenset[int] = frozenset(),
+        tested: frozenset[int] = frozenset(),
     ) -> Choice:
         """What to do from where things and the robot are.
 
@@ -158,6 +159,7 @@ class NamoPlanner:
             state: as read.
             robot: its middle [m].
             avoided: things that are not to be tried now.
+            tested: things that have had a test push, and told what one tells.
         """
         num = self.room.num_things
         poses = np.asarray(state.pose, float)[:num]
@@ -200,7 +202,12 @@ class NamoPlanner:
             able = [t for t in own if t.probability > 0.0]
             trial = min(able, key=lambda t: self.believer.mass(t.thing))
         elif self.character.has_tests:
-            worth = [worth_of_test(own, t, values, GIVE_UP) for t in order.trials]
+            worth = [
+                -math.inf
+                if one.thing in tested
+                else worth_of_test(own, one, values, GIVE_UP)
+                for one in order.trials
+            ]
             best = int(np.argmax(worth))
             if worth[best] > 0.0:
                 trial, is_test = order.trials[best], True

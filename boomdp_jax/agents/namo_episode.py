@@ -14,6 +14,7 @@ from boomdp_jax.agents.namo_agent import (
     Choice,
     NamoPlanner,
 )
+from boomdp_jax.agents.namo_touch import pressed_steps
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.envs.namo import (
     NOBODY,
@@ -109,6 +110,8 @@ class _Episode:
         self.seconds: list[float] = []
         self.effort = self.most_force = self.most_overlap = 0.0
         self.num_steps = 0
+        # Whether the last step was one that was learnt from.
+        self._follows = False
         # The world's step takes half a minute to compile; the first plan is made
         # meanwhile.
         nothing = pushing(jnp.zeros(3))
@@ -158,10 +161,12 @@ class _Episode:
             self.carry_out(command)
         return bool(np.linalg.norm(self.robot - way[-1]) < near)
 
-    def decide(self, avoided: frozenset[int]) -> Choice:
+    def decide(self, avoided: frozenset[int], tested: frozenset[int]) -> Choice:
         """Choose, and keep the time."""
         begin = time.perf_counter()
-        choice = self.planner.choose(self.split(), self.read, self.robot, avoided)
+        choice = self.planner.choose(
+            self.split(), self.read, self.robot, avoided, tested
+        )
         self.seconds.append(time.perf_counter() - begin)
         return choice
 
@@ -238,16 +243,30 @@ class _Episode:
         if not self.character.learns:
             return
         reading = driven.reading
-        held = np.asarray(reading.held) == thing
-        rows = []
-        for index in np.flatnonzero(held):
+        # Without steps in which the thing was pressed against another.
+        pressed = pressed_steps(
+            self.world.scene,
+            reading.before,
+            reading.after,
+            jnp.asarray(thing),
+            self.world.robot,
+            reading.wrench[:, :2],
+        )
+        told = (np.asarray(reading.held) == thing) & ~np.asarray(pressed)
+        rows, follows = [], self._follows and not is_new
+        for index, is_told in enumerate(told.tolist()):
             before, after = (
                 State(part.pose[index, thing][None], part.twist[index, thing][None])
                 for part in (reading.before, reading.after)
             )
-            rows.append(Row(before, reading.wrench[index][None], after))
+            if is_told:
+                rows.append(
+                    Row(before, reading.wrench[index][None], after, not follows)
+                )
+            follows = is_told
+        self._follows = follows
         if rows:
-            self.belief.update(self.split(), thing, rows, is_new=is_new)
+            self.belief.update(self.split(), thing, rows)
 
     def _is_joined(self, choice: Choice) -> bool:
         """Whether the robot can get from where it is to where it wanted to."""
@@ -280,9 +299,10 @@ def run_namo(
     """
     episode = _Episode(key, room, character, belief)
     avoided: set[int] = set()
+    tested: set[int] = set()
     count = np.zeros(room.num_things, int)
     while not episode.is_over:
-        choice = episode.decide(frozenset(avoided))
+        choice = episode.decide(frozenset(avoided), frozenset(tested))
         labels = choice.labels
         here, _ = episode.planner.region_at(labels, episode.robot)
         if here == choice.goal_region and here > 0:
@@ -303,6 +323,8 @@ def run_namo(
             continue
         thing = choice.trial.thing
         opened = episode.attempt(choice)
+        if choice.is_test:
+            tested.add(thing)
         if opened:
             avoided.clear()
         elif not choice.is_test or not episode.tries[-1].num_pushes:

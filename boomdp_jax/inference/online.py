@@ -111,7 +111,8 @@ class OnlineBelief:
             has_varying_dt: whether `step` is told each step's length instead, which
                 costs a little more.
             change_rate: prior probability per transition that the world changes, for
-                the test that a surprise leads to.
+                the test that a surprise leads to; with zero it never does, and a
+                surprise leads to a fit of all rows from anywhere.
             num_noise_levels: of each structure of a lone body, over which its noise is
                 averaged. With one, noise is taken for what the last refit found: steps
                 and refits take two thirds of the time, and the belief comes out too

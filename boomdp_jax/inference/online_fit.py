@@ -41,7 +41,7 @@ from boomdp_jax.physics.scene_spec import SceneSpec
 FIRST_TEST = 4
 """A change is looked for when so many rows have come since readings grew odd."""
 
-# Rows are fitted from what is known where they are not so many times those fitted
+# Rows are fitted from what is known where they are at most so many times those fitted
 # before, and where no body went that much farther, in terms of what anchors of pins are
 # scaled by.
 _GROWN, _FARTHER = 2.0, 1.0
@@ -66,7 +66,7 @@ class RefitSettings(NamedTuple):
     is_uniform: bool
     forgetting: float
     change_rate: float
-    """Prior probability that the world changes, per transition."""
+    """Prior probability that the world changes, per transition; zero: it never does."""
     num_levels: int = 1
     """Of the noise of each structure of a lone body (`noise_levels`)."""
     fit: FitSettings = FitSettings()
@@ -93,8 +93,8 @@ def refit_settings(
         )
     if not 0.0 < forgetting <= 1.0:
         raise ValueError(f"forgetting: expected in (0, 1], got {forgetting}")
-    if not 0.0 < change_rate < 1.0:
-        raise ValueError(f"change_rate: expected in (0, 1), got {change_rate}")
+    if not 0.0 <= change_rate < 1.0:
+        raise ValueError(f"change_rate: expected in [0, 1), got {change_rate}")
     if num_levels < 1:
         raise ValueError(f"num_noise_levels: expected at least 1, got {num_levels}")
     if "actuator.delay" in spec.unknown_numbers:
@@ -233,7 +233,7 @@ def _is_alike(belief: BlockBelief, block: Block, num_rows: int) -> bool:
     change = np.abs(np.asarray(after.spread) - np.asarray(before.spread))
     farther = np.maximum(np.hypot(*moved.T), change) / reach
     is_near = bool(np.all(farther < _FARTHER))
-    return is_near and num_rows < _GROWN * int(belief.fit.num_rows)
+    return is_near and num_rows <= _GROWN * int(belief.fit.num_rows)
 
 
 def _in_coordinates_of(belief: BlockBelief, target: StructureTarget) -> StructureTarget:

@@ -34,6 +34,7 @@ from boomdp_jax.inference.online_fit import (
     num_levels_for,
 )
 from boomdp_jax.inference.online_state import BlockBelief, FitRecord, Suspicion
+from boomdp_jax.inference.online_step import ALARM
 from boomdp_jax.inference.structure_draws import start_mixtures
 from boomdp_jax.inference.target import StructureTarget
 
@@ -157,13 +158,16 @@ def refit_block(
     since = int(suspicion.since)
     num_after = num_rows - since
     is_asked = (
-        since - begin >= FIRST_TEST
+        settings.change_rate > 0.0
+        and since - begin >= FIRST_TEST
         and num_after >= FIRST_TEST
         and (bool(suspicion.is_open) or float(suspicion.log_factor) > 0)
     )
+    # Of a world that does not change, what was believed of it was wrong.
+    is_wrong = float(suspicion.log_factor) > ALARM
     all_key, again_key, after_key, before_key = jax.random.split(key, 4)
     fit = Fitter(settings, bodies, history)
-    is_warm = not is_asked and _is_known(belief)
+    is_warm = not is_asked and not is_wrong and _is_known(belief)
     account = None
     if is_warm:
         account = fit(all_key, begin, num_rows, known=belief)

@@ -46,9 +46,7 @@ class RoomBelief(abc.ABC):
         """The thing alone."""
 
     @abc.abstractmethod
-    def update(
-        self, key: Key, thing: int, rows: Sequence[Row], *, is_new: bool
-    ) -> None:
+    def update(self, key: Key, thing: int, rows: Sequence[Row]) -> None:
         """Learn from one push."""
 
     @abc.abstractmethod
@@ -92,9 +90,7 @@ class FixedRoom(RoomBelief):
         """The thing alone."""
         return self._scenes[thing]
 
-    def update(
-        self, key: Key, thing: int, rows: Sequence[Row], *, is_new: bool
-    ) -> None:
+    def update(self, key: Key, thing: int, rows: Sequence[Row]) -> None:
         """Nothing is learnt."""
 
     def shares(self, thing: int) -> dict[str, float]:
@@ -153,13 +149,9 @@ class LearntRoom(RoomBelief):
         """The thing alone."""
         return self._models[thing].scene
 
-    def update(
-        self, key: Key, thing: int, rows: Sequence[Row], *, is_new: bool
-    ) -> None:
+    def update(self, key: Key, thing: int, rows: Sequence[Row]) -> None:
         """Learn from one push."""
-        self._learnt[thing] = self._models[thing].update(
-            key, self._learnt[thing], rows, is_new=is_new
-        )
+        self._learnt[thing] = self._models[thing].update(key, self._learnt[thing], rows)
         if self._shares:
             self._tell_kin()
 

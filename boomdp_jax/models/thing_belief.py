@@ -36,6 +36,8 @@ class Row(NamedTuple):
     before: State
     wrench: Float[Array, "1 3"]
     after: State
+    begins: bool
+    """Whether the thing may have moved since the row before."""
 
 
 class ThingLearnt(NamedTuple):
@@ -61,6 +63,8 @@ class ThingModel:
             num_particles=_NUM_PARTICLES,
             # Whether a push opens a way hardly depends on how well a mass is known.
             num_noise_levels=1,
+            # Furniture stays what it is.
+            change_rate=0.0,
         )
 
     def init(self, key: Key) -> ThingLearnt:
@@ -70,28 +74,25 @@ class ThingModel:
         draws = self.online.sample_params(draw_key, belief, NUM_HYPOTHESES)
         return ThingLearnt(belief, draws, 0)
 
-    def update(
-        self, key: Key, learnt: ThingLearnt, rows: Sequence[Row], *, is_new: bool
-    ) -> ThingLearnt:
+    def update(self, key: Key, learnt: ThingLearnt, rows: Sequence[Row]) -> ThingLearnt:
         """Learn from one push.
 
         Args:
             key: random key.
             learnt: so far.
             rows: its steps, one after another.
-            is_new: whether the thing may have moved since the last push.
 
         Returns:
             What is known then, with fresh hypotheses.
         """
         belief, asks = learnt.belief, False
-        for index, row in enumerate(rows):
+        for row in rows:
             belief, info = self.online.step(
                 belief,
                 row.before,
                 row.wrench,
                 row.after,
-                starts_episode=is_new and index == 0,
+                starts_episode=row.begins,
             )
             asks = asks or bool(info.needs_refit)
         num_pushes = learnt.num_pushes + 1

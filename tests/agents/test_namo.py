@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from boomdp_jax.agents import Character, NamoPlanner, run_namo
+from boomdp_jax.agents import Character, NamoPlanner, namo_agent, run_namo
 from boomdp_jax.agents.manipulation import (
     GAP,
     actions_of,
@@ -123,6 +123,19 @@ def test_hope_falls_after_a_push_that_moved_nothing():
     after = chosen(one, FixedRoom(one, [draws])).trial
     assert choice.trial.probability > 0.5
     assert after is None or after.probability < 0.5 * choice.trial.probability
+
+
+@pytest.mark.slow
+def test_a_thing_is_tested_once_at_most(monkeypatch):
+    # One who learns nothing, and to whom a test always seems to pay.
+    monkeypatch.setattr(namo_agent, "worth_of_test", lambda *_: 1.0)
+    one = room(thing(pose=IN_THE_DOOR, kind="fixed"))
+    believes = lone_params(thing(pose=IN_THE_DOOR), NUM_HYPOTHESES)
+    tests = Character("tests", learns=False, has_tests=True)
+    record = run_namo(KEY, one, tests, FixedRoom(one, [believes]))
+    assert not record.is_solved
+    assert [one.is_test for one in record.tries[:2]] == [True, False]
+    assert sum(one.is_test for one in record.tries) == 1
 
 
 def test_grasps_are_round_the_thing_and_just_out_of_its_way():

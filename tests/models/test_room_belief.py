@@ -47,7 +47,7 @@ def test_a_fixed_belief_tells_shares_and_mass_and_never_changes():
     believer = FixedRoom(one, [stacked(things)])
     assert abs(believer.mass(0) - 0.5 * (things[0].mass + things[1].mass)) < 1e-9
     before = believer.belief(0), believer.version(0)
-    believer.update(jax.random.key(0), 0, [], is_new=True)
+    believer.update(jax.random.key(0), 0, [])
     assert before[0] is believer.belief(0)
     assert before[1] == believer.version(0)
     shares = believer.shares(0)
