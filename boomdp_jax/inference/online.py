@@ -247,11 +247,18 @@ class OnlineBelief:
                 f"dt: expected {expected}, with has_varying_dt="
                 f"{not self._settings.is_uniform}; got {dt}"
             )
-        length = jnp.asarray(self._dt if dt is None else dt, float)
-        begins = jnp.asarray(starts_episode, bool)
-        return self._step(
-            belief, state.array, jnp.asarray(wrench), next_state.array, length, begins
+        # Of a given type, since for a weak one the same would be compiled again.
+        before, push, after, length = (
+            jnp.asarray(part, float)
+            for part in (
+                state.array,
+                wrench,
+                next_state.array,
+                self._dt if dt is None else dt,
+            )
         )
+        begins = jnp.asarray(starts_episode, bool)
+        return self._step(belief, before, push, after, length, begins)
 
     def observe(
         self,
