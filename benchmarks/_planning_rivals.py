@@ -108,6 +108,10 @@ def rivals(
         ),
     }
     chosen = names or tuple(made)
+    if unknown := set(chosen) - set(made):
+        raise SystemExit(
+            f"--planners: expected some of {sorted(made)}, got {sorted(unknown)}"
+        )
     return [
         Rival(name, _called(planner, {**common, **options}, reuses), reuses)
         for name, (planner, options, reuses) in made.items()
