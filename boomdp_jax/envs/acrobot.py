@@ -6,7 +6,7 @@ hardly separate models, those on an acrobot do (Ramesh and Ravindran 2023).
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, Key
 from boomdp_jax.envs.action_set import ActionSet
@@ -17,10 +17,8 @@ from boomdp_jax.envs.environment import (
     uniform_near,
     wrapped,
 )
-from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
 from boomdp_jax.physics.state import State
-from boomdp_jax.physics.step import step
 
 LINK, HALF_WIDTH, DENSITY, GRAVITY = 0.5, 0.03, 30.0, 9.81
 TORQUE = 1.5
@@ -101,12 +99,6 @@ class Acrobot(AbstractEnvironment):
         )
         return State(places, jnp.zeros_like(places))
 
-    def advance(
-        self, physics: Params, state: State, wrench: Float[Array, "body 3"]
-    ) -> State:
-        """One step of the engine."""
-        return step(self.scene, physics, state, wrench)[0]
-
     def reward(
         self,
         state: State,
@@ -133,10 +125,6 @@ class Acrobot(AbstractEnvironment):
         """Cosines and sines of the links' angles, and their spins."""
         angle = state.pose[:, 2]
         return jnp.concatenate([jnp.cos(angle), jnp.sin(angle), state.twist[:, 2]])
-
-    def moved_freely(self, state: State, next_state: State) -> Bool[Array, " body"]:
-        """Always: there is nothing to run into."""
-        return jnp.ones(2, bool)
 
 
 def tip_below_top(state: State) -> FloatScalar:

@@ -19,6 +19,7 @@ from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.scene_spec import SceneSpec
 from boomdp_jax.physics.state import State
+from boomdp_jax.physics.step import step
 
 
 class EnvParams(eqx.Module):
@@ -83,11 +84,11 @@ class AbstractEnvironment(abc.ABC):
     def start(self, key: Key, params: EnvParams) -> State:
         """Draw a start."""
 
-    @abc.abstractmethod
     def advance(
         self, physics: Params, state: State, wrench: Float[Array, "body 3"]
     ) -> State:
-        """One step of the world under a hypothesis, walls included."""
+        """One step of the world under a hypothesis, walls included: the engine's."""
+        return step(self.scene, physics, state, wrench)[0]
 
     @abc.abstractmethod
     def reward(
@@ -115,12 +116,13 @@ class AbstractEnvironment(abc.ABC):
     def observe(self, state: State) -> Float[Array, " number"]:
         """What a policy without physics is told."""
 
-    @abc.abstractmethod
     def moved_freely(self, state: State, next_state: State) -> Bool[Array, " body"]:
         """Whether an observer can tell that a body touched nothing in between.
 
-        What is learnt of a body's own numbers should rest on such steps alone.
+        What is learnt of a body's own numbers should rest on such steps alone. Always,
+        where there is nothing to run into.
         """
+        return jnp.ones(self.spec.num_bodies, bool)
 
     def happens(
         self, physics: Params, state: State, wrench: Float[Array, "body 3"]

@@ -34,7 +34,6 @@ from boomdp_jax.envs.furniture import PIECES, WALLS, Piece, piece_scene, room_sc
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
-from boomdp_jax.physics.step import step
 
 GOAL_RADIUS = 0.1
 PUSH = 220.0
@@ -135,12 +134,6 @@ class LivingRoom(AbstractEnvironment):
         """Draw poses, at rest."""
         pose = uniform_near(key, params.start, params.start_spread)
         return State(pose, jnp.zeros_like(pose))
-
-    def advance(
-        self, physics: Params, state: State, wrench: Float[Array, "body 3"]
-    ) -> State:
-        """One step of the engine, contacts and all."""
-        return step(self.scene, physics, state, wrench)[0]
 
     def reward(
         self,

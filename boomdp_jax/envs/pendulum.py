@@ -7,7 +7,7 @@ angle from upright in radians; a learner without physics sees x, y and their rat
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, Key
 from boomdp_jax.envs.action_set import forces_round_circle
@@ -17,10 +17,8 @@ from boomdp_jax.envs.environment import (
     PlanningHints,
     uniform_near,
 )
-from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
 from boomdp_jax.physics.state import State
-from boomdp_jax.physics.step import step
 
 LENGTH, RADIUS, DENSITY, GRAVITY = 0.6, 0.05, 100.0, 9.81
 FORCE_SHARE = 0.35
@@ -97,12 +95,6 @@ class Pendulum(AbstractEnvironment):
             jnp.append(pivot - lever, angle)[None], jnp.append(velocity, spin)[None]
         )
 
-    def advance(
-        self, physics: Params, state: State, wrench: Float[Array, "body 3"]
-    ) -> State:
-        """One step of the engine."""
-        return step(self.scene, physics, state, wrench)[0]
-
     def reward(
         self,
         state: State,
@@ -131,10 +123,6 @@ class Pendulum(AbstractEnvironment):
     def observe(self, state: State) -> Float[Array, " number"]:
         """x, y and their rates [m, m/s]."""
         return jnp.concatenate([state.pose[0, :2], state.twist[0, :2]])
-
-    def moved_freely(self, state: State, next_state: State) -> Bool[Array, " body"]:
-        """Always: there is nothing to run into."""
-        return jnp.ones(1, bool)
 
 
 def angle_from_upright(state: State) -> FloatScalar:
