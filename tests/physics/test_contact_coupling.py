@@ -148,7 +148,7 @@ def test_bystanders_change_nothing():
 
     away = [
         body(f"bystander_{i}", (0.3, 0.2), (10.0 + 2.0 * i, 10.0, 0.3))
-        for i in range(4)
+        for i in range(3)
     ]
     few, many = _room(robot_x=-0.5), _room(robot_x=-0.5, others=away)
     alone = jax.jit(lambda force: path(few, force))
