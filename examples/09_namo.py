@@ -86,7 +86,9 @@ for offset, (shares, label, color) in enumerate(
 bars.set_yticks(np.arange(len(kinds)) + 0.2, kinds, fontsize=7)
 bars.set_title(f"belief: the {room.things[first.thing].name} is", fontsize=8)
 bars.legend(fontsize=6, loc="lower right")
-bars.set(xlim=(0, 1))
+bars.set(xlim=(0, 1), xticks=(0, 0.5, 1))
+bars.set_xlabel("probability", fontsize=7)
+bars.tick_params(axis="x", labelsize=7)
 path = arguments.out / "namo.png"
 figure.savefig(path, dpi=110)
 print(path)

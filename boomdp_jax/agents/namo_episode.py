@@ -112,8 +112,7 @@ class _Episode:
         self.num_steps = 0
         # Whether the last step was one that was learnt from.
         self._follows = False
-        # The world's step takes half a minute to compile; the first plan is made
-        # meanwhile.
+        # The world's step takes long to compile; the first plan is made meanwhile.
         nothing = pushing(jnp.zeros(3))
         self._compiled: Future | None = _COMPILER.submit(
             drive, key, self.world, self.state, nothing
@@ -255,11 +254,11 @@ class _Episode:
         told = (np.asarray(reading.held) == thing) & ~np.asarray(pressed)
         rows, follows = [], self._follows and not is_new
         for index, is_told in enumerate(told.tolist()):
-            before, after = (
-                State(part.pose[index, thing][None], part.twist[index, thing][None])
-                for part in (reading.before, reading.after)
-            )
             if is_told:
+                before, after = (
+                    State(part.pose[index, thing][None], part.twist[index, thing][None])
+                    for part in (reading.before, reading.after)
+                )
                 rows.append(
                     Row(before, reading.wrench[index][None], after, not follows)
                 )

@@ -163,7 +163,7 @@ def refit_block(
         and num_after >= FIRST_TEST
         and (bool(suspicion.is_open) or float(suspicion.log_factor) > 0)
     )
-    # Of a world that does not change, what was believed of it was wrong.
+    # What was believed is no place to start from: modes are looked for everywhere.
     is_wrong = float(suspicion.log_factor) > ALARM
     all_key, again_key, after_key, before_key = jax.random.split(key, 4)
     fit = Fitter(settings, bodies, history)

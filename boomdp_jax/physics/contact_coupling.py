@@ -108,9 +108,11 @@ def coupled_substep(
     problem = velocity_problem(prepared, motion, force)
     before = moved, tuple(motion[3:])
     num_bodies = motion.x.shape[0]
+    stage = _first_stage(problem, motion, touch)
+    given = sweeping(contacts, stage.eases, prepared.length, num_bodies)
 
     def sweep_with(stage: _Stage) -> Sweeping:
-        return sweeping(contacts, stage.eases, prepared.length, num_bodies)
+        return given._replace(eases=stage.eases)
 
     def begun(stage: _Stage) -> _Stage:
         """Nothing but the impulses of the substep before."""
@@ -156,7 +158,6 @@ def coupled_substep(
         return new._replace(solution=solved.solution, is_done=solved.is_settled), None
 
     order = [0, 1, *[2] * (num_sweeps - 1), 3]
-    stage = _first_stage(problem, motion, touch)
     if is_many(num_bodies):
         # Sweeps and solves are compiled once.
         stage, _ = jax.lax.scan(advance, stage, jnp.asarray(order, jnp.int32))

@@ -49,7 +49,7 @@ def solve_velocity(problem: VelocityProblem) -> Solved:
         Twists and impulses.
     """
     unknown = jnp.ones(problem.mass.shape[-1], bool)
-    return _iterated(problem, first_guess(problem), unknown, 0)
+    return solve_from(problem, first_guess(problem), unknown, 0)
 
 
 def solve_from(
@@ -69,17 +69,12 @@ def solve_from(
     Returns:
         Twists and impulses.
     """
+    # In the first turn of all, everything sticks.
     x, y, spin = (
         jnp.where(turn > 0, now, old)
         for now, old in zip(guess.twist, guess.before, strict=True)
     )
-    return _iterated(problem, guess._replace(before=(x, y, spin)), is_open, turn)
-
-
-def _iterated(
-    problem: VelocityProblem, guess: Solution, is_open: Bool[Array, " lane"], turn: Any
-) -> Solved:
-    """Newton's method; in the first turn of all, everything sticks."""
+    guess = guess._replace(before=(x, y, spin))
     has_friction = problem.contacts is not None or problem.spins is not None
     if not has_friction and problem.laws is None and problem.limits is None:
         return newton_step(problem, guess)

@@ -122,8 +122,7 @@ def runs_of(shapes: list[Shape]) -> list[tuple[Shape, int, int]]:
     runs: list[tuple[Shape, int, int]] = []
     for level, shape in enumerate(shapes):
         like = shape if shape.num_below else shape.as_merged()
-        is_more = runs and runs[-1][0] == like and like.num_below == like.num_nodes
-        if is_more:
+        if runs and runs[-1][0] == like and like.num_below == like.num_nodes:
             runs[-1] = (like, runs[-1][1], runs[-1][2] + 1)
         else:
             runs.append((shape, level, 1))
