@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from boomdp_jax.inference.draw_moves import Proposed, about_means, by_differences
 from boomdp_jax.inference.evaluate import evaluate_points, log_prior_density
 from boomdp_jax.inference.filter_points import filter_densities
 from boomdp_jax.inference.fit import Fits, Host
@@ -34,13 +35,14 @@ _MAX_STEPS = 20
 _MOVES_BETWEEN, _LAST_MOVES = 1, 2
 # Where the first weights count for this share of the draws one move will do.
 _GOOD_SHARE = 0.5
-# Lengths of steps relative to the best for a normal density, tried in turn.
-_STEP_SIZES = (1.0, 0.4)
+# Kinds of moves, made in turn, and length of steps by differences.
+_KINDS = ("mean", "difference")
+_STEP_SIZE = 0.4
 # Lineages below which draws are moved on, at most so often, until they are less like
 # what they were than this; and likeness beyond which a result is doubted.
 _FEW_LINEAGES, _MOST_MOVES, _MOST_ALIKE, _TOO_ALIKE = 50.0, 24, 0.5, 0.8
-# Draws of a group from which its spread is taken.
-_LEAST_GROUP = 4
+# Share of an object's draws that a structure has to have for that to count.
+_COUNTED_SHARE = 0.05
 # Distinct draws that are left of all, below which a result is doubted.
 _LEAST_LEFT = 0.02
 
@@ -136,8 +138,8 @@ def infer_noise(
         is_easy = steps == 1 and np.all(first_size > _GOOD_SHARE * structure[0].size)
         num_moves = _LAST_MOVES if is_last and not is_easy else _MOVES_BETWEEN
         for number in range(num_moves):
-            size = _STEP_SIZES[(steps + number) % len(_STEP_SIZES)]
-            draws = problem.move(rng, draws, power, size)
+            kind = _KINDS[(steps + number) % len(_KINDS)]
+            draws = problem.move(rng, draws, power, kind)
     draws, likeness = problem.spread(rng, draws, power)
     shape = structure.shape
     changed = reweighed(
@@ -242,13 +244,12 @@ class _Problem:
         root = np.arange(len(z))
         return _Draws(structure, z, vector, group, first, last, root)
 
-    def move(self, rng, draws: _Draws, power: np.ndarray, size: float) -> _Draws:
+    def move(self, rng, draws: _Draws, power: np.ndarray, kind: str) -> _Draws:
         """One Metropolis step of every draw, along the spread of its group."""
         power = power[self._index]
-        step = self._steps(rng, draws, size)
+        proposed = self._propose(rng, draws, kind)
         dim = draws.z.shape[1]
-        z = self._host.wrap(draws.z + step[:, :dim])
-        vector = draws.vector + step[:, dim:]
+        z, vector = proposed.values[:, :dim], proposed.values[:, dim:]
         last = self._log_last(draws.structure, z, vector)
         first = np.zeros_like(last)
         if np.any(power < 1.0):
@@ -256,9 +257,18 @@ class _Problem:
             first = found.log_density
             first = first + self._proposal.log_density(vector, draws.group)
         trial = draws._replace(z=z, vector=vector, log_first=first, log_last=last)
-        gain = _tempered(trial, power) - _tempered(draws, power)
+        gain = _tempered(trial, power) - _tempered(draws, power) + proposed.log_ratio
         is_accepted = np.log(rng.random(len(gain))) < gain
         return trial.where(is_accepted, draws)
+
+    def _propose(self, rng, draws: _Draws, kind: str) -> Proposed:
+        values = np.concatenate([draws.z, draws.vector], axis=1)
+        num_noise = draws.vector.shape[1]
+        period = np.concatenate([self._host.period, np.zeros(num_noise)])
+        if kind == "mean":
+            return about_means(rng, values, draws.group, period)
+        num_moved = self._host.in_use.sum(axis=1)[draws.structure] + num_noise
+        return by_differences(rng, values, draws.group, period, num_moved, _STEP_SIZE)
 
     def spread(
         self, rng, draws: _Draws, power: np.ndarray
@@ -284,11 +294,11 @@ class _Problem:
         problem._proposal = self._proposal
         begin = np.concatenate([few.z, few.vector], axis=1)
         for number in range(_MOST_MOVES):
-            few = problem.move(rng, few, power, _STEP_SIZES[number % len(_STEP_SIZES)])
+            few = problem.move(rng, few, power, _KINDS[number % len(_KINDS)])
             here = np.concatenate([few.z, few.vector], axis=1)
             for i in asked:
                 own = index == i
-                likeness[i] = _likeness(begin[own], here[own])
+                likeness[i] = _likeness(begin[own], here[own], few.group[own])
             if np.all(likeness < _MOST_ALIKE):
                 break
         joined = [np.array(part) for part in draws]
@@ -302,26 +312,6 @@ class _Problem:
         value = value + log_prior_density(self._targets, self._index, structure, z)
         return value + log_noise_prior(self._scale, vector)
 
-    def _steps(self, rng, draws: _Draws, size: float) -> np.ndarray:
-        """Differences of two draws of the group, stretched at random.
-
-        Ter Braak (2006), A Markov chain Monte Carlo version of differential evolution.
-        """
-        order = np.argsort(draws.group, kind="stable")
-        num = np.bincount(draws.group)[draws.group]
-        begin = np.searchsorted(draws.group[order], draws.group)
-        pick = [
-            order[begin + (rng.random(len(num)) * num).astype(int)] for _ in range(2)
-        ]
-        dim = self._host.in_use.sum(axis=1)[draws.structure] + draws.vector.shape[1]
-        size = size * 2.38 / np.sqrt(2.0 * dim)[:, None]
-        both = np.concatenate([draws.z, draws.vector], axis=1)
-        step = both[pick[0]] - both[pick[1]]
-        dim = draws.z.shape[1]
-        step[:, :dim] = self._host.wrap(step[:, :dim])
-        stretch = size * np.exp(rng.standard_normal((len(num), 1)) * 0.5)
-        return np.where((num >= _LEAST_GROUP)[:, None], stretch * step, 0.0)
-
 
 def _lineages(root: np.ndarray) -> np.ndarray:
     """How many lineages of equal size would be as uneven, `[object]`."""
@@ -329,12 +319,23 @@ def _lineages(root: np.ndarray) -> np.ndarray:
     return np.array([num.sum() ** 2 / (num**2).sum() for num in counts], float)
 
 
-def _likeness(before: np.ndarray, after: np.ndarray) -> float:
-    """Largest correlation of any number, `[draw, number]` before and after moves."""
-    a, b = before - before.mean(axis=0), after - after.mean(axis=0)
-    length = np.sqrt(np.sum(a**2, axis=0) * np.sum(b**2, axis=0))
-    seen = length > 0
-    return float(np.max(np.sum(a * b, axis=0)[seen] / length[seen], initial=0.0))
+def _likeness(before: np.ndarray, after: np.ndarray, group: np.ndarray) -> float:
+    """Largest correlation of any number, `[draw, number]` before and after moves.
+
+    Within groups, which moves do not leave; those of a few draws are passed over.
+    """
+    largest = 0.0
+    for name, num in zip(*np.unique(group, return_counts=True), strict=True):
+        if num < _COUNTED_SHARE * len(group):
+            continue
+        a, b = (
+            x[group == name] - x[group == name].mean(axis=0) for x in (before, after)
+        )
+        length = np.sqrt(np.sum(a**2, axis=0) * np.sum(b**2, axis=0))
+        seen = length > 0
+        each = np.sum(a * b, axis=0)[seen] / length[seen]
+        largest = float(np.max(each, initial=largest))
+    return largest
 
 
 def _ratio(draws: _Draws) -> np.ndarray:
