@@ -14,7 +14,7 @@ from boomdp_jax.agents.namo_agent import (
     Choice,
     NamoPlanner,
 )
-from boomdp_jax.agents.namo_touch import pressed_steps
+from boomdp_jax.agents.namo_hand import Hand
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.envs.namo import (
     NOBODY,
@@ -23,6 +23,7 @@ from boomdp_jax.envs.namo import (
     grasped,
     is_at_goal,
     make_world,
+    with_delay,
 )
 from boomdp_jax.envs.namo_drive import (
     NUM_STEPS,
@@ -34,7 +35,6 @@ from boomdp_jax.envs.namo_drive import (
 )
 from boomdp_jax.envs.namo_room import TIME_STEP, Room
 from boomdp_jax.models.room_belief import RoomBelief
-from boomdp_jax.models.thing_belief import Row
 from boomdp_jax.physics.state import State
 
 LONGEST = 150.0
@@ -99,9 +99,18 @@ class NamoRecord(NamedTuple):
 class _Episode:
     """What goes on while the robot is at it."""
 
-    def __init__(self, key: Key, room: Room, character: Character, belief: RoomBelief):
+    def __init__(
+        self,
+        key: Key,
+        room: Room,
+        character: Character,
+        belief: RoomBelief,
+        delay: int,
+    ):
         self.key, self.room, self.character = key, room, character
-        self.world, self.state = make_world(room)
+        self.world, start = make_world(room)
+        self.state = with_delay(start, delay)
+        self.delay = delay
         self.belief = belief
         self.planner = NamoPlanner(room, character, belief)
         self.read: State = self.state.physics
@@ -110,8 +119,7 @@ class _Episode:
         self.seconds: list[float] = []
         self.effort = self.most_force = self.most_overlap = 0.0
         self.num_steps = 0
-        # Whether the last step was one that was learnt from.
-        self._follows = False
+        self.hand = Hand(self.world, delay)
         # The world's step takes long to compile; the first plan is made meanwhile.
         nothing = pushing(jnp.zeros(3))
         self._compiled: Future | None = _COMPILER.submit(
@@ -134,7 +142,7 @@ class _Episode:
         return key
 
     def carry_out(self, command: Command) -> Driven:
-        """Drive, and keep count."""
+        """Drive, and keep count; what was felt is that of the steps that are told."""
         if self._compiled is not None:
             self._compiled.result()
             self._compiled = None
@@ -145,7 +153,7 @@ class _Episode:
         self.most_force = max(self.most_force, float(driven.force))
         self.most_overlap = max(self.most_overlap, float(driven.overlap))
         self.num_steps += NUM_STEPS
-        return driven
+        return self.hand.paired(driven)
 
     def go(self, way: np.ndarray, near: float) -> bool:
         """Along a way; whether its end was reached."""
@@ -215,13 +223,16 @@ class _Episode:
             if self.is_over or (num > 0 and (hope <= 0.0 or is_stuck)):
                 return num, False
             before = np.asarray(self.read.pose, float)[trial.thing]
-            driven = self.carry_out(pushing(jnp.asarray(action, float)))
+            driven = [self.carry_out(pushing(jnp.asarray(action, float)))]
+            # What came of a push is seen late: it stands still until then.
+            for _ in range(-(-self.delay // NUM_STEPS)):
+                driven.append(self.carry_out(self._standing()))
             begin = time.perf_counter()
             after = np.asarray(self.read.pose, float)[trial.thing]
             moved = np.linalg.norm(after[:2] - before[:2])
             moved += self.room.things[trial.thing].reach * abs(after[2] - before[2])
             num_still = num_still + 1 if moved < _STIR else 0
-            self._learn(trial.thing, driven, is_new=num == 0)
+            self._learn(trial.thing, driven)
             shares.append(self.belief.shares(trial.thing))
             if self._is_joined(choice) and self._comes_to_rest(choice):
                 return num + 1, True
@@ -235,35 +246,18 @@ class _Episode:
             twist = np.asarray(self.read.twist, float)[self.room.num_things]
             if np.hypot(twist[0], twist[1]) < _SLOW or int(self.state.held) == NOBODY:
                 break
-            self.carry_out(going(self.robot[None], self.room.robot.speed))
+            self.carry_out(self._standing())
         return self._is_joined(choice)
 
-    def _learn(self, thing: int, driven: Driven, *, is_new: bool) -> None:
+    def _standing(self) -> Command:
+        """To stay where it is."""
+        return going(self.robot[None], self.room.robot.speed)
+
+    def _learn(self, thing: int, driven: list[Driven]) -> None:
+        """From the last commands."""
         if not self.character.learns:
             return
-        reading = driven.reading
-        # Without steps in which the thing was pressed against another.
-        pressed = pressed_steps(
-            self.world.scene,
-            reading.before,
-            reading.after,
-            jnp.asarray(thing),
-            self.world.robot,
-            reading.wrench[:, :2],
-        )
-        told = (np.asarray(reading.held) == thing) & ~np.asarray(pressed)
-        rows, follows = [], self._follows and not is_new
-        for index, is_told in enumerate(told.tolist()):
-            if is_told:
-                before, after = (
-                    State(part.pose[index, thing][None], part.twist[index, thing][None])
-                    for part in (reading.before, reading.after)
-                )
-                rows.append(
-                    Row(before, reading.wrench[index][None], after, not follows)
-                )
-            follows = is_told
-        self._follows = follows
+        rows = self.hand.rows(thing, driven)
         if rows:
             self.belief.update(self.split(), thing, rows)
 
@@ -283,7 +277,12 @@ class _Episode:
 
 
 def run_namo(
-    key: Key, room: Room, character: Character, belief: RoomBelief
+    key: Key,
+    room: Room,
+    character: Character,
+    belief: RoomBelief,
+    *,
+    delay: int = 0,
 ) -> NamoRecord:
     """Let a robot get to its goal.
 
@@ -292,11 +291,17 @@ def run_namo(
         room: the room, the truth included.
         character: what sort of agent it is.
         belief: what it believes of the room's things; changed by what it learns.
+        delay: of the poses and twists that it reads, in steps of the world; the hand
+            feels at once. It knows of it, and waits after each push for what came of
+            it.
 
     Returns:
         What happened.
+
+    Raises:
+        ValueError: a negative delay.
     """
-    episode = _Episode(key, room, character, belief)
+    episode = _Episode(key, room, character, belief, delay)
     avoided: set[int] = set()
     tested: set[int] = set()
     count = np.zeros(room.num_things, int)

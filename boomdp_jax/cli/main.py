@@ -202,6 +202,12 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     add("--things", type=_whole(2), metavar="K", help="of namo: in a random room; 4")
     add("--difficulty", type=_scale, metavar="D", help="of namo: from 0 to 1; 0.5")
     add(
+        "--delay",
+        type=_whole(0),
+        metavar="N",
+        help="of namo: steps by which poses are read late; default: 0",
+    )
+    add(
         "--out",
         required=True,
         metavar="DIR",

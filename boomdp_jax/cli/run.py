@@ -23,7 +23,7 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.task == "namo":
         _run_namo(arguments)
         return
-    for name in ("room", "things", "difficulty"):
+    for name in ("room", "things", "difficulty", "delay"):
         if getattr(arguments, name) is not None:
             raise ValueError(
                 f"--{name}: expected none for {arguments.task}, which is no room to "
@@ -62,6 +62,7 @@ def _run_namo(arguments: argparse.Namespace) -> None:
         "room": arguments.room,
         "num_things": arguments.things,
         "difficulty": arguments.difficulty,
+        "delay": arguments.delay,
     }
     begun = begin_namo(
         arguments.agent,

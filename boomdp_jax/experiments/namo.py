@@ -62,19 +62,22 @@ def make_room(name: str, seed: int, num_things: int, difficulty: float) -> Room:
     raise ValueError(f"room: expected story or random, got {name!r}")
 
 
-def namo_episode(agent: str, room: Room, seed: int) -> tuple[NamoRecord, RoomBelief]:
+def namo_episode(
+    agent: str, room: Room, seed: int, *, delay: int = 0
+) -> tuple[NamoRecord, RoomBelief]:
     """One agent in one room.
 
     Args:
         agent: one of `CHARACTERS`.
         room: the room, the truth included.
         seed: of sensors, of what is drawn from beliefs, of the planner.
+        delay: of the poses and twists that it reads, in steps.
 
     Returns:
         What happened, and what is believed in the end.
 
     Raises:
-        ValueError: no such agent.
+        ValueError: no such agent, or a negative delay.
     """
     if agent not in CHARACTERS:
         raise ValueError(
@@ -82,7 +85,8 @@ def namo_episode(agent: str, room: Room, seed: int) -> tuple[NamoRecord, RoomBel
         )
     belief_key, episode_key = jax.random.split(jax.random.key(seed))
     belief = belief_of(agent, belief_key, room)
-    return run_namo(episode_key, room, CHARACTERS[agent], belief), belief
+    record = run_namo(episode_key, room, CHARACTERS[agent], belief, delay=delay)
+    return record, belief
 
 
 def belief_of(agent: str, key: Key, room: Room) -> RoomBelief:

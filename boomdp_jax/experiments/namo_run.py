@@ -36,6 +36,8 @@ class NamoRun(NamedTuple):
     """`random` or `story`."""
     num_things: int
     difficulty: float
+    delay: int = 0
+    """Of readings, in steps."""
 
     def path(self, seed: int) -> Path:
         """File of one room."""
@@ -60,7 +62,7 @@ class NamoRun(NamedTuple):
         """
         for seed in seeds:
             room = make_room(self.room, seed, self.num_things, self.difficulty)
-            record, _ = namo_episode(self.agent, room, seed)
+            record, _ = namo_episode(self.agent, room, seed, delay=self.delay)
             write_npz(self.path(seed), arrays_of(record))
             if report is not None:
                 report(seed, record)
@@ -92,6 +94,7 @@ def begin_namo(
     room: str = "random",
     num_things: int = 4,
     difficulty: float = 0.5,
+    delay: int = 0,
 ) -> NamoRun:
     """Begin a run in a folder, or take up one that was begun there.
 
@@ -102,6 +105,7 @@ def begin_namo(
         room: `random` or `story`.
         num_things: in a random room.
         difficulty: of a random room.
+        delay: of the poses and twists that the robot reads, in steps.
 
     Returns:
         The run.
@@ -117,9 +121,13 @@ def begin_namo(
         raise ValueError(
             f"agent: expected one of {', '.join(CHARACTERS)} in namo; got {agent!r}"
         )
+    if delay < 0:
+        raise ValueError(f"delay: expected at least 0 steps, got {delay}")
     # Refuses what is no room.
     num_things = make_room(room, 0, num_things, difficulty).num_things
-    run = NamoRun(Path(folder), agent, num_seeds, room, num_things, float(difficulty))
+    run = NamoRun(
+        Path(folder), agent, num_seeds, room, num_things, float(difficulty), delay
+    )
     run.folder.mkdir(parents=True, exist_ok=True)
     content = {
         "schema": SCHEMA,
@@ -129,6 +137,7 @@ def begin_namo(
         "room": room,
         "num_things": num_things,
         "difficulty": float(difficulty),
+        "delay": delay,
         "versions": library_versions(),
     }
     path = run.folder / "run.json"
