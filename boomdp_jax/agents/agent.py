@@ -14,6 +14,7 @@ from boomdp_jax.models.model import AbstractModel
 from boomdp_jax.physics.state import State
 from boomdp_jax.planning.belief import Belief
 from boomdp_jax.planning.plan import Plan, plan_of
+from boomdp_jax.planning.problem import LeafFn
 from boomdp_jax.planning.sparse_sampling import sparse_sampling
 
 PlanFn = Callable[[Key, Any, State, Plan | None], Plan]
@@ -92,7 +93,7 @@ def make_agent(
     num_hypotheses: int = 4,
     capacity: int | None = None,
     exploration: float = 0.0,
-    has_leaf: bool = True,
+    leaf_fn: LeafFn | None = None,
     explore: ExploreFn | None = None,
 ) -> Agent:
     """An agent that plans with sparse sampling, by a task's own hints.
@@ -105,7 +106,8 @@ def make_agent(
         num_hypotheses: drawn from the model for each decision.
         capacity: nodes of a level; default: the task's hint.
         exploration: probability that a decision is any action.
-        has_leaf: whether the task's leaf value is used, or zero.
+        leaf_fn: `(hypothesis, state) -> value` of what is left at the horizon; default:
+            the task's leaf value.
         explore: what may be done instead of the planned action.
 
     Returns:
@@ -143,7 +145,7 @@ def make_agent(
             actions=task.actions.wrench,
             depth=hints.depth,
             action_repeat=hints.action_repeat,
-            leaf_fn=leaf if has_leaf else None,
+            leaf_fn=leaf if leaf_fn is None else leaf_fn,
             num_hypotheses=num_hypotheses,
             cell_size=cells,
             stratum_size=strata,

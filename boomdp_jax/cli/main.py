@@ -37,6 +37,8 @@ AGENTS = (
     "ensemble",
     "physics-kinds",
     "papers",
+    "true-way",
+    "physics-way",
     "random",
     "prior",
     "optimistic",

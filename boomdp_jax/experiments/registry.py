@@ -14,7 +14,7 @@ from boomdp_jax.envs.cart import Cart
 from boomdp_jax.envs.environment import AbstractEnvironment, EnvParams
 from boomdp_jax.envs.living_room import LivingRoom
 from boomdp_jax.envs.pendulum import Pendulum
-from boomdp_jax.experiments.papers_agent import papers_agent
+from boomdp_jax.experiments.papers_agent import papers_agent, way_leaf
 from boomdp_jax.experiments.recipes import RECIPES, Recipe, Subject
 from boomdp_jax.experiments.room_agents import room_agent
 from boomdp_jax.experiments.sensors import with_sensors
@@ -36,11 +36,21 @@ TASKS: Mapping[str, MakeTask] = MappingProxyType(
 )
 """Each takes `num_steps`."""
 
+_ALONG_WAYS: Mapping[str, str] = MappingProxyType(
+    {"true-way": "true", "physics-way": "physics"}
+)
+"""Agents that are what another one is, and are told how long ways round walls are."""
+
 TASK_OF: Mapping[str, str] = MappingProxyType(
-    {"physics-kinds": "living-room", "papers": "cart"}
+    {
+        "physics-kinds": "living-room",
+        "papers": "cart",
+        **dict.fromkeys(_ALONG_WAYS, "cart"),
+    }
 )
 """Agents that can do one task only: `physics-kinds` knows kinds of furniture, `papers`
-plans a path to an end for one body."""
+plans a path to an end for one body, `true-way` and `physics-way` know the ways there
+as it does."""
 _NOT_IN_ROOM = ("physics-residual",)
 """Agents that cannot do the living room, where models are piece by piece."""
 AGENTS = ("true", *RECIPES, *TASK_OF, "random")
@@ -127,11 +137,16 @@ def agent_of(
     teaching_key = jax.random.fold_in(jax.random.key(0), _TEACHING)
     if isinstance(task, LivingRoom):
         return room_agent(name, task, params, teaching_key, reading_noise)
+    leaf_fn = None
+    if isinstance(task, Cart) and name in _ALONG_WAYS:
+        name, leaf_fn = _ALONG_WAYS[name], way_leaf(task, params)
     if name in ("true", "random"):
         known = TrueModel(params.physics, task.happens)
         if name == "random":
             return random_agent(known, task.hints.action_repeat)
-        return make_agent(name, task, known, params.goal, num_hypotheses=1)
+        return make_agent(
+            name, task, known, params.goal, num_hypotheses=1, leaf_fn=leaf_fn
+        )
     if isinstance(task, Cart) and name == "papers":
         return papers_agent(task, params)
     recipe = RECIPES[name]
@@ -149,6 +164,7 @@ def agent_of(
         params.goal,
         num_hypotheses=recipe.num_hypotheses,
         exploration=recipe.exploration,
+        leaf_fn=leaf_fn,
         explore=_explore(recipe, task, model),
     )
 
