@@ -292,10 +292,14 @@ class _Problem:
         few, index = draws.take(rows), self._index[rows]
         problem = _Problem(self._targets, index)
         problem._proposal = self._proposal
-        begin = np.concatenate([few.z, few.vector], axis=1)
+        begin = here = np.concatenate([few.z, few.vector], axis=1)
+        reach = dict.fromkeys(_KINDS, np.inf)
         for number in range(_MOST_MOVES):
-            few = problem.move(rng, few, power, _KINDS[number % len(_KINDS)])
-            here = np.concatenate([few.z, few.vector], axis=1)
+            # The kind that goes farther, and now and then the other, which may by now.
+            kind = (min if number % 4 == 3 else max)(reach, key=lambda k: reach[k])
+            few = problem.move(rng, few, power, kind)
+            last, here = here, np.concatenate([few.z, few.vector], axis=1)
+            reach[kind] = _reach(last, here)
             for i in asked:
                 own = index == i
                 likeness[i] = _likeness(begin[own], here[own], few.group[own])
@@ -317,6 +321,14 @@ def _lineages(root: np.ndarray) -> np.ndarray:
     """How many lineages of equal size would be as uneven, `[object]`."""
     counts = [np.unique(each, return_counts=True)[1] for each in root]
     return np.array([num.sum() ** 2 / (num**2).sum() for num in counts], float)
+
+
+def _reach(before: np.ndarray, after: np.ndarray) -> float:
+    """Mean square of a move over the variance, of the middle one of all numbers."""
+    spread = after.var(axis=0)
+    seen = spread > 0
+    square = np.mean((after - before)[:, seen] ** 2, axis=0)
+    return float(np.median(square / spread[seen]))
 
 
 def _likeness(before: np.ndarray, after: np.ndarray, group: np.ndarray) -> float:
