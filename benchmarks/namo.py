@@ -101,6 +101,22 @@ def report_rooms(reporter, case, run, found, agent, num) -> None:
             target=blind[best] if asked else None,
             met=value < blind[best] if asked else None,
         )
+    for name in blind if agent == "physics" else ():
+        # Both in the same rooms: what sets rooms apart is left out.
+        more = found[name]["num_wasted"] - run["num_wasted"].astype(float)
+        band = 1.96 * float(more.std(ddof=1)) / math.sqrt(len(more))
+        reporter.report(
+            case=case,
+            metric=f"wasted pushes fewer than those of {name}, room by room",
+            value=float(more.mean()),
+            unit="pushes",
+            n=len(more),
+            spread=band,
+            peer=name,
+            peer_value=blind[name],
+            target=0.0 if num == 4 else None,
+            met=bool(more.mean() > band) if num == 4 else None,
+        )
     seconds = run["decision_seconds"]
     is_asked = agent == "physics"
     value = float(np.nanmedian(seconds))

@@ -142,7 +142,8 @@ def begin_namo(
     }
     path = run.folder / "run.json"
     if path.exists():
-        check_same(path, read_json(path, SCHEMA), content)
+        # Runs of older versions do not name a delay; there was none.
+        check_same(path, {"delay": 0, **read_json(path, SCHEMA)}, content)
     else:
         write_json(path, content)
     return run
