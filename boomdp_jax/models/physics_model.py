@@ -11,6 +11,7 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from boomdp_jax.core.arrays import BoolScalar, Key
@@ -29,6 +30,10 @@ _FIRST_REFITS = (1, 2, 4)
 particles are too few for what a single push tells, and a planner waits for it."""
 
 
+_MOST_STOPPED = 64
+"""Steps that were left out whose wrenches are remembered."""
+
+
 class PhysicsLearnt(NamedTuple):
     """What the physics has come to, on the host."""
 
@@ -37,6 +42,8 @@ class PhysicsLearnt(NamedTuple):
     """Taken in so far."""
     is_broken: bool
     """Whether steps were left out since the last row."""
+    stopped: tuple[np.ndarray, ...] = ()
+    """Wrenches of those steps, `[body, 3]` each, latest last."""
 
 
 class PhysicsModel(AbstractModel):
@@ -84,7 +91,8 @@ class PhysicsModel(AbstractModel):
     ) -> PhysicsLearnt:
         """Take one transition in, and fit anew where the belief asks for it."""
         if not bool(jnp.all(self.moved_freely(state, next_state))):
-            return learnt._replace(is_broken=True)
+            stopped = (*learnt.stopped, np.asarray(wrench, float))
+            return learnt._replace(is_broken=True, stopped=stopped[-_MOST_STOPPED:])
         belief, info = self.online.step(
             learnt.belief,
             state,

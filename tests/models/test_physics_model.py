@@ -45,6 +45,8 @@ def test_a_few_pushes_tell_what_a_cart_is(task):
         pushed, num_free = pushed + 1, num_free + is_free
         assert learnt.num_rows == num_free
         assert learnt.is_broken == (not is_free)
+        # What was tried since the last row that told something.
+        assert bool(learnt.stopped) == (not is_free)
         before = after
     assert num_free >= 3
     # One that ends at a wall is not learnt from.
@@ -52,6 +54,7 @@ def test_a_few_pushes_tell_what_a_cart_is(task):
     assert not bool(task.moved_freely(before, at_wall)[0])
     skipped = model.update(learnt, before, task.actions[0], at_wall)
     assert skipped.is_broken
+    np.testing.assert_array_equal(skipped.stopped[-1], task.actions[0])
     assert skipped.num_rows == learnt.num_rows
     belief = model.sample(jax.random.key(1), learnt, 64)
     wheel = belief.hypotheses.wheel
