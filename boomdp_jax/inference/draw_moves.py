@@ -57,11 +57,11 @@ def by_differences(
     num = np.bincount(group)[group]
     begin = np.searchsorted(group[order], group)
     pick = [order[begin + (rng.random(len(num)) * num).astype(int)] for _ in range(2)]
-    step = _wrap(values[pick[0]] - values[pick[1]], period)
+    step = wrapped(values[pick[0]] - values[pick[1]], period)
     length = size * 2.38 / np.sqrt(2.0 * num_moved)[:, None]
     stretch = length * np.exp(rng.standard_normal((len(num), 1)) * 0.5)
     step = np.where((num >= _LEAST_GROUP)[:, None], stretch * step, 0.0)
-    return Proposed(_wrap(values + step, period), np.zeros(len(num)))
+    return Proposed(wrapped(values + step, period), np.zeros(len(num)))
 
 
 def about_means(
@@ -86,7 +86,7 @@ def about_means(
     for name in np.unique(group):
         rows = np.flatnonzero(group == name)
         center = _mean(values[rows], period)
-        offset = _wrap(values[rows] - center, period)
+        offset = wrapped(values[rows] - center, period)
         sd = offset.std(axis=0)
         used = np.flatnonzero(sd > 1e-12 * np.maximum(np.abs(center), 1.0))
         if not used.size or len(rows) < _LEAST_FOR_EACH * used.size:
@@ -99,7 +99,7 @@ def about_means(
         new = np.sqrt(1.0 - share**2) * now
         new = new + share * rng.standard_normal(now.shape)
         moved = (new @ factor.T) * sd
-        out[np.ix_(rows, used)] = _wrap(center[used] + moved, period[used])
+        out[np.ix_(rows, used)] = wrapped(center[used] + moved, period[used])
         is_inside = np.all(np.abs(moved) < half[used], axis=1)
         gain = 0.5 * (np.sum(new**2, axis=1) - np.sum(now**2, axis=1))
         log_ratio[rows] = np.where(is_inside, gain, -np.inf)
@@ -114,8 +114,13 @@ def _mean(values: np.ndarray, period: np.ndarray) -> np.ndarray:
     return np.where(period > 0, angle / turn, values.mean(axis=0))
 
 
-def _wrap(values: np.ndarray, period: np.ndarray) -> np.ndarray:
-    """Numbers with a period brought into half of it about zero."""
+def wrapped(values: np.ndarray, period: np.ndarray) -> np.ndarray:
+    """Numbers with a period brought into half of it about zero.
+
+    Args:
+        values: `[*any, number]`.
+        period: of each number; zero: it has none, and stays.
+    """
     length = np.where(period > 0, period, 1.0)
-    wrapped = values - length * np.floor(values / length + 0.5)
-    return np.where(period > 0, wrapped, values)
+    turned = values - length * np.floor(values / length + 0.5)
+    return np.where(period > 0, turned, values)

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from boomdp_jax.core.arrays import on_device
+from boomdp_jax.inference.draw_moves import wrapped
 from boomdp_jax.inference.evaluate import evaluate_points
 from boomdp_jax.inference.one_step import NOISE_SHAPE
 from boomdp_jax.inference.target import StructureTarget
@@ -113,8 +114,7 @@ class Host(NamedTuple):
 
     def wrap(self, z: np.ndarray) -> np.ndarray:
         """Bring angles into half a period about zero."""
-        period = np.where(self.period > 0, self.period, 1.0)
-        return np.where(self.period > 0, z - period * np.floor(z / period + 0.5), z)
+        return wrapped(z, self.period)
 
 
 def make_fits(
