@@ -133,7 +133,7 @@ def acrobot() -> Task:
     )
 
     def transition(key, hypothesis, state, action):
-        wrench = jnp.zeros((2, 3)).at[:, 2].set(jnp.stack([-action, action]))
+        wrench = jnp.zeros((2, 3)).at[:, 2].set(jnp.concatenate([-action, action]))
         state, _ = step(spec.scene, hypothesis, state, wrench)
         return state, False
 
@@ -156,7 +156,7 @@ def acrobot() -> Task:
         name="acrobot",
         transition_fn=transition,
         reward_fn=lambda h, s, a, n: -below_top(n),
-        actions=TORQUE * jnp.array([-1.0, 0.0, 1.0]),
+        actions=TORQUE * jnp.array([[-1.0], [0.0], [1.0]]),
         hypothesis=spec.params(),
         leaves={
             "zero": lambda h, s: 0.0,
