@@ -20,6 +20,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import jax  # noqa: E402
+import jaxtyping  # noqa: E402
 import pytest  # noqa: E402
 from jaxtyping import install_import_hook  # noqa: E402
 
@@ -70,3 +71,11 @@ def precision(request: pytest.FixtureRequest) -> Iterator[Precision]:
     """Run the test once on 32 bit floats and, among slow ones, once on 64 bit ones."""
     with jax.enable_x64(request.param == 64):
         yield Precision(request.param)
+
+
+@pytest.fixture
+def no_type_checks() -> Iterator[None]:
+    """Run the test as users run the package: nothing is checked but by itself."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)

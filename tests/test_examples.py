@@ -84,6 +84,7 @@ def test_second_example_weighs_a_made_up_pendulum(tmp_path):
     assert_is_picture(tmp_path / "out" / "real_pendulum.png")
 
 
+@pytest.mark.slow
 def test_second_example_says_which_recording_is_missing(tmp_path):
     result = run_example("02_real_pendulum.py", tmp_path)
     assert result.returncode == 2

@@ -201,7 +201,12 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     add("--seeds", type=_whole(1), default=20, metavar="N", help="episodes: 0 to N - 1")
     add("--steps", type=_whole(1), metavar="T", help="of each; default: the task's")
     add("--room", choices=("random", "story"), help="of namo; default: random")
-    add("--things", type=_whole(2), metavar="K", help="of namo: in a random room; 4")
+    add(
+        "--things",
+        type=_whole(2),
+        metavar="K",
+        help="of namo: in a random room, 2 to 12; default: 4",
+    )
     add("--difficulty", type=_scale, metavar="D", help="of namo: from 0 to 1; 0.5")
     add(
         "--delay",

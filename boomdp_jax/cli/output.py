@@ -8,6 +8,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from boomdp_jax.core.atomic import check_folder_takes_files
+
 _FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 
 
@@ -55,7 +57,7 @@ def check_writable(path: str | None) -> None:
         path: where to; None: nowhere.
 
     Raises:
-        ValueError: its folder is missing, or it is a folder.
+        ValueError: its folder is missing or takes no files, or it is a folder.
     """
     if path is None:
         return
@@ -63,6 +65,13 @@ def check_writable(path: str | None) -> None:
         raise ValueError(f"{path}: expected an existing folder to write to, got none")
     if Path(path).is_dir():
         raise ValueError(f"{path}: expected a file to write to, got a folder")
+    try:
+        check_folder_takes_files(path)
+    except OSError as error:
+        raise ValueError(
+            f"{path}: expected a folder to write to, got one that takes no files "
+            f"({error.strerror})"
+        ) from error
 
 
 def check_figure(path: str | None) -> None:

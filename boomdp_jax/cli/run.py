@@ -58,6 +58,12 @@ def _run_namo(arguments: argparse.Namespace) -> None:
             raise ValueError(
                 f"--{name}: expected none for namo, got {getattr(arguments, name)}"
             )
+    for name in ("things", "difficulty"):
+        if arguments.room == "story" and getattr(arguments, name) is not None:
+            raise ValueError(
+                f"--{name}: expected none with --room story, got "
+                f"{getattr(arguments, name)}"
+            )
     given = {
         "room": arguments.room,
         "num_things": arguments.things,

@@ -1,12 +1,19 @@
 """What was observed: a fixed-capacity, masked table of transitions."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from boomdp_jax.core.applied_force import wrench_at_reference
 from boomdp_jax.core.arrays import IntScalar, on_device
+from boomdp_jax.core.checked_input import (
+    check_fits,
+    episode_array,
+    real_array,
+    whole_number,
+)
 
 
 class Transition(eqx.Module):
@@ -70,8 +77,9 @@ class History(eqx.Module):
             The history, itself if it has that capacity.
 
         Raises:
-            ValueError: fewer than it has.
+            ValueError: fewer than it has, or no whole number.
         """
+        capacity = whole_number("capacity", capacity, 0)
         more = capacity - self.capacity
         if more < 0:
             raise ValueError(
@@ -131,33 +139,36 @@ def make_history(
         The history, on the default float type.
 
     Raises:
-        ValueError: a wrong shape, an action that is not finite, a step length that is
-            not positive, an infinite reading, a force at a point of a body that was not
+        ValueError: a wrong shape, what is no real number, an action that is not finite,
+            a step length that is not positive, an infinite reading, numbers that the
+            float type cannot hold, an episode that is no whole number of 32 bit or is
+            taken up again, an unknown frame, a force at a point of a body that was not
             seen, or more rows than the capacity.
     """
-    state, action = np.asarray(state, float), np.asarray(action, float)
-    next_state = np.asarray(next_state, float)
+    if point_frame not in ("world", "body"):
+        raise ValueError(f"point_frame: expected world or body, got {point_frame!r}")
+    state, action = real_array("state", state), real_array("action", action)
+    next_state, dt = real_array("next_state", next_state), real_array("dt", dt)
     if state.ndim != 3 or state.shape[-1] != 6:
         raise ValueError(f"state: expected shape [time, body, 6], got {state.shape}")
     num_rows, num_bodies = state.shape[:2]
-    capacity = num_rows if capacity is None else capacity
+    capacity = num_rows if capacity is None else whole_number("capacity", capacity, 0)
     if capacity < num_rows:
         raise ValueError(f"capacity: expected at least {num_rows} rows, got {capacity}")
-    episode = np.zeros(num_rows, int) if episode is None else np.asarray(episode)
-    dt = np.broadcast_to(np.asarray(dt, float), (num_rows,))
     expected = {
         "action": (action, (num_rows, num_bodies, 3)),
         "next_state": (next_state, (num_rows, num_bodies, 6)),
-        "episode": (episode, (num_rows,)),
     }
     if point is not None:
-        point = np.asarray(point, float)
+        point = real_array("point", point)
         expected["point"] = (point, (num_rows, num_bodies, 2))
     for name, (array, shape) in expected.items():
         if array.shape != shape:
             raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
-    if not np.all(np.isfinite(dt)) or not np.all(dt > 0):
-        raise ValueError(f"dt: expected positive seconds, got {np.min(dt)}")
+    episode = episode_array(
+        np.zeros(num_rows) if episode is None else episode, num_rows
+    )
+    dt = _each_dt(dt, num_rows)
     if not np.all(np.isfinite(action)):
         row, body, _ = np.argwhere(~np.isfinite(action))[0]
         raise ValueError(
@@ -171,10 +182,13 @@ def make_history(
                 f"{name}: expected finite readings or NaN for a missing one, got "
                 f"{array[row, body]} in row {row}, body {body}"
             )
+        check_fits(name, array)
+    check_fits("action", action)
     if point is not None:
         needed = 2 if point_frame == "world" else 3
         _check_point(action, point, state[..., :needed])
         action = wrench_at_reference(action, point, state[..., :3], frame=point_frame)
+        check_fits("action", action)
     is_chained = np.zeros(num_rows, bool)
     if num_rows > 1:
         now, before = state[1:], next_state[:-1]
@@ -196,6 +210,20 @@ def make_history(
         next_state_mask=on_device(pad(~np.isnan(next_state)), bool),
         is_chained=on_device(pad(is_chained), bool),
     )
+
+
+def _each_dt(dt: np.ndarray, num_rows: int) -> np.ndarray:
+    """Length of each step; one that the float type takes for zero is none."""
+    if dt.shape not in ((), (1,), (num_rows,)):
+        raise ValueError(
+            f"dt: expected one number or shape ({num_rows},), got shape {dt.shape}"
+        )
+    with np.errstate(over="ignore", under="ignore"):
+        held = dt.astype(jax.dtypes.canonicalize_dtype(float))
+    is_right = np.isfinite(held) & (held > 0)
+    if not np.all(is_right):
+        raise ValueError(f"dt: expected positive seconds, got {dt[~is_right].flat[0]}")
+    return np.broadcast_to(dt, (num_rows,))
 
 
 def _check_point(action: np.ndarray, point: np.ndarray, pose: np.ndarray) -> None:

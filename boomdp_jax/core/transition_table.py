@@ -7,6 +7,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Int
 
+from boomdp_jax.core.checked_input import episode_array
 from boomdp_jax.core.history import History, make_history
 
 _STATIC_TOLERANCE = 1e-3
@@ -231,20 +232,17 @@ def read_episode(
     """
     if "episode" not in arrays:
         return np.zeros(num_rows, np.int32)
-    episode = read_array(arrays, "episode", source, (num_rows,))
-    is_whole = arrays["episode"].dtype.kind in "iu"
-    if not is_whole or np.any(np.abs(episode) >= 2**31):
+    read_array(arrays, "episode", source, (num_rows,))
+    given = arrays["episode"]
+    if given.dtype.kind not in "iu":
         raise ValueError(
             f"{source}: episode: expected whole numbers of 32 bit, got an array of "
-            f"{arrays['episode'].dtype}"
+            f"{given.dtype}"
         )
-    starts = np.flatnonzero(np.diff(episode, prepend=np.nan) != 0)
-    if len(starts) > len(np.unique(episode)):
-        raise ValueError(
-            f"{source}: episode: expected the rows of an episode to follow each other, "
-            "got one that is taken up again"
-        )
-    return episode.astype(np.int32)
+    try:
+        return episode_array(given, num_rows)
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from error
 
 
 def match_scene(table: TransitionTable, spec: ObservedScene) -> TransitionTable:

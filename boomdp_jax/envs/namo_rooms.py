@@ -23,7 +23,11 @@ Wall = tuple[float, float, float, float]
 _WIDE, _HIGH, _THICK = 8.0, 6.0, 0.16
 _STORY_ROBOT = Robot(radius=0.4)
 """The paper's is 105 by 75 pixels; a disc of 80."""
-_MOST_TRIES = 400
+_MOST_THINGS = 12
+"""Of which a room is found within seconds. With 14 one try may take several; with 20,
+a minute may not be enough."""
+_MOST_TRIES = 30
+"""Every second try or so is a room, whatever its number of things."""
 # Share of each kind, by label: free, heavy, wheels, revolute, fixed.
 _KIND_SHARES: Mapping[str, tuple[float, ...]] = MappingProxyType(
     {
@@ -89,7 +93,7 @@ def random_room(seed: int, num_things: int, *, difficulty: float = 0.5) -> Room:
 
     Args:
         seed: which; the same seed is the same room.
-        num_things: at least two.
+        num_things: from 2 to 12, of which a room is found within seconds.
         difficulty: from 0, nothing is heavy, pinned or fixed, to 1, twice as much as
             usual.
 
@@ -97,11 +101,11 @@ def random_room(seed: int, num_things: int, *, difficulty: float = 0.5) -> Room:
         A room that can be solved.
 
     Raises:
-        ValueError: fewer things than two, or a difficulty outside [0, 1].
-        RuntimeError: no such room was found among many.
+        ValueError: fewer or more things, a difficulty outside [0, 1], or a seed for
+            which no such room was found among many.
     """
-    if num_things < 2:
-        raise ValueError(f"num_things: expected at least 2, got {num_things}")
+    if not 2 <= num_things <= _MOST_THINGS:
+        raise ValueError(f"num_things: expected 2 to {_MOST_THINGS}, got {num_things}")
     if not 0.0 <= difficulty <= 1.0:
         raise ValueError(f"difficulty: expected in [0, 1], got {difficulty}")
     rng = np.random.default_rng([num_things, seed])
@@ -109,8 +113,10 @@ def random_room(seed: int, num_things: int, *, difficulty: float = 0.5) -> Room:
         room = _try_room(rng, num_things, difficulty)
         if room is not None and is_closed(room) and is_solvable(room):
             return check_room(room)
-    raise RuntimeError(
-        f"no room of {num_things} things was found for seed {seed} in {_MOST_TRIES}"
+    raise ValueError(
+        f"seed: expected one with a room of {num_things} things that can be solved, "
+        f"got {seed}, which has none in {_MOST_TRIES} tries; take fewer things or less "
+        "difficulty"
     )
 
 

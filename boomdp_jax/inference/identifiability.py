@@ -18,11 +18,11 @@ import numpy as np
 
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.core.history import History
+from boomdp_jax.inference.arguments import check_history
 from boomdp_jax.inference.block import Block, stack_blocks
 from boomdp_jax.inference.find_modes import find_modes
 from boomdp_jax.inference.fit import Fits, FitSettings, Host, normal_equations
 from boomdp_jax.inference.fixed_structure import Structure, structure_blocks
-from boomdp_jax.inference.infer import check_history
 from boomdp_jax.inference.model_sites import Site, block_sites
 from boomdp_jax.physics.scene_spec import SceneSpec
 

@@ -10,9 +10,11 @@ import numpy as np
 from jax.sharding import Mesh
 
 from boomdp_jax.core.arrays import Key
+from boomdp_jax.core.checked_input import whole_number
 from boomdp_jax.core.compile_time import CompileClock
 from boomdp_jax.core.history import History
 from boomdp_jax.core.spread import spread_over
+from boomdp_jax.inference.arguments import check_arguments
 from boomdp_jax.inference.assemble import assemble_posterior
 from boomdp_jax.inference.block import Block, make_block, stack_blocks
 from boomdp_jax.inference.compile_ahead import signature
@@ -102,11 +104,12 @@ def infer(
         motion follows a law that the model lacks (`residual`; not with `nuts`, `svi`).
 
     Raises:
+        TypeError: a key, scene, history or mesh that is none.
         ValueError: an unknown method or likelihood, or two that do not go together, a
-            horizon that is no positive whole number, a history of another number of
-            bodies or, for predictions from exact starts, without such, a scene with
-            more structures than can be told apart, a prior that makes no sense, a mesh
-            of several axes.
+            horizon or count that is no positive whole number, a history of another
+            number of bodies or, for predictions from exact starts, without such, a
+            scene with more structures than can be told apart, a prior that makes no
+            sense, a mesh of several axes.
     """
     return infer_batch(
         key,
@@ -171,12 +174,10 @@ def infer_batch(
         raise ValueError(
             f"method: expected one of {', '.join(METHODS)}; got {method!r}"
         )
-    if len(specs) != len(histories):
-        raise ValueError(
-            f"histories: expected one per scene, {len(specs)}, got {len(histories)}"
-        )
-    for spec, history in zip(specs, histories, strict=True):
-        check_history(spec, history)
+    check_arguments(key, specs, histories, mesh)
+    num_chains = whole_number("num_chains", num_chains, 1)
+    num_warmup = whole_number("num_warmup", num_warmup, 0)
+    num_samples = whole_number("num_samples", num_samples, 1)
     if outliers not in OUTLIERS:
         raise ValueError(
             f"outliers: expected one of {', '.join(OUTLIERS)}; got {outliers!r}"
@@ -316,18 +317,11 @@ def seed_of(key: Key) -> int:
     return int.from_bytes(words.astype(">u4").tobytes(), "big")
 
 
-def check_history(spec: SceneSpec, history: History) -> None:
-    """Raise ValueError unless a history is about a scene that can be inferred."""
-    if history.num_bodies != spec.num_bodies:
-        raise ValueError(
-            f"{spec.source}: history: expected {spec.num_bodies} bodies, got "
-            f"{history.num_bodies}"
-        )
-
-
 def padded_histories(histories: Sequence[History]) -> list[History]:
     """Histories with few different capacities, none of over four times its own."""
-    longest = max((history.capacity for history in histories), default=0)
+    # An empty table has room for one row, from which shapes can be told.
+    longest = max((history.capacity for history in histories), default=1)
+    longest = max(longest, 1)
     out = []
     for history in histories:
         capacity = longest

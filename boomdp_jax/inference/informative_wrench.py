@@ -25,8 +25,10 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int
 
 from boomdp_jax.core.arrays import Key
+from boomdp_jax.core.checked_input import real_array, whole_number
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.physics import step
+from boomdp_jax.physics.arguments import check_state_is_finite, checked_state
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
@@ -75,9 +77,10 @@ def informative_wrench(
 
     Raises:
         ValueError: no candidate, wrenches of another number of bodies or not finite, a
-            count that is not positive.
+            count that is no positive whole number, no state, or a state of another
+            number of bodies or not finite.
     """
-    wrenches = np.asarray(candidates)
+    wrenches = real_array("candidates", candidates)
     num_bodies = posterior.spec.num_bodies
     if wrenches.ndim != 3 or wrenches.shape[1:] != (num_bodies, 3) or not len(wrenches):
         raise ValueError(
@@ -87,9 +90,11 @@ def informative_wrench(
     if not np.all(np.isfinite(wrenches)):
         index = int(np.argwhere(~np.isfinite(wrenches))[0, 0])
         raise ValueError(f"candidates: expected finite wrenches, got one at {index}")
-    for name, count in (("num_steps", num_steps), ("num_draws", num_draws)):
-        if count < 1:
-            raise ValueError(f"{name}: expected at least 1, got {count}")
+    num_steps = whole_number("num_steps", num_steps, 1)
+    num_draws = whole_number("num_draws", num_draws, 1)
+    state = checked_state(posterior.spec.num_bodies, state)
+    # Of a body that is nowhere every candidate would tell the same.
+    check_state_is_finite(state, posterior.spec.names)
     thinned = posterior.thin(num_draws)
     scene = posterior.spec.scene
     gain, structure_gain, error = _gains(
@@ -104,7 +109,7 @@ def informative_wrench(
     )
     best = int(np.argmax(np.asarray(gain)))
     return InformationGain(
-        best, jnp.asarray(wrenches[best]), gain, structure_gain, error
+        best, jnp.asarray(wrenches[best], float), gain, structure_gain, error
     )
 
 

@@ -27,7 +27,9 @@ DIRECTION = {"wheel": 2, "prismatic": 0}
 wheel's heading, a drawer's axis."""
 
 _MAX_STRUCTURES = 4096
-
+_MAX_SLOTS = 12
+"""Constraints that may exist in a block: as many as `_MAX_STRUCTURES` allows where each
+exists at most once. Programs grow with them: 18 took over two minutes to compile."""
 
 BODY_NUMBERS = {
     "center_of_mass": 2,
@@ -223,7 +225,8 @@ def structures(
         Active slots, `[structure, slot]`, and normalised log-probabilities.
 
     Raises:
-        ValueError: more structures than can be told apart one by one.
+        ValueError: more structures than can be told apart one by one, or of more
+            constraints than compile in reasonable time.
     """
     groups: dict[tuple, list[int]] = {}
     for i, slot in enumerate(layout.slots):
@@ -234,6 +237,12 @@ def structures(
             f"unknown: {math.prod(sizes)} structures of a block of "
             f"{layout.num_bodies} bodies; expected at most {_MAX_STRUCTURES}; lower "
             "the caps in 'unknown'"
+        )
+    if len(layout.slots) > _MAX_SLOTS:
+        raise ValueError(
+            f"unknown: {len(layout.slots)} constraints of a block of "
+            f"{layout.num_bodies} bodies; expected at most {_MAX_SLOTS}; lower the "
+            "caps in 'unknown'"
         )
     needs_load = [slot.kind in ("wheel", "ground") for slot in layout.slots]
     needs_load = np.array(needs_load, bool)

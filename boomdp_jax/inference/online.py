@@ -26,10 +26,10 @@ from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import BoolScalar, Key, on_device
 from boomdp_jax.core.history import History, make_history
+from boomdp_jax.inference.arguments import check_history
 from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.compile_ahead import signature
 from boomdp_jax.inference.components import independent_blocks
-from boomdp_jax.inference.infer import check_history
 from boomdp_jax.inference.online_fit import make_online_block, refit_settings
 from boomdp_jax.inference.online_posterior import (
     best_params,
@@ -45,6 +45,7 @@ from boomdp_jax.inference.online_refit import (
 from boomdp_jax.inference.online_refresh import LEAVING_SHARE, OnlineInfo, refresh
 from boomdp_jax.inference.online_state import BeliefState, BlockBelief
 from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.physics.arguments import checked_state, checked_wrench
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene_spec import SceneSpec
 from boomdp_jax.physics.state import State
@@ -239,7 +240,8 @@ class OnlineBelief:
             The belief, and what happened.
 
         Raises:
-            ValueError: a step length where all are equal, or none where they vary.
+            ValueError: a step length where all are equal, or none where they vary;
+                states or a wrench of another shape.
         """
         if (dt is None) != self._settings.is_uniform:
             expected = "none" if self._settings.is_uniform else "seconds"
@@ -247,16 +249,14 @@ class OnlineBelief:
                 f"dt: expected {expected}, with has_varying_dt="
                 f"{not self._settings.is_uniform}; got {dt}"
             )
+        num = self.spec.num_bodies
         # Of a given type, since for a weak one the same would be compiled again.
-        before, push, after, length = (
-            jnp.asarray(part, float)
-            for part in (
-                state.array,
-                wrench,
-                next_state.array,
-                self._dt if dt is None else dt,
-            )
+        before, after = (
+            jnp.asarray(checked_state(num, part, name).array, float)
+            for name, part in (("state", state), ("next_state", next_state))
         )
+        push = jnp.asarray(checked_wrench(num, wrench), float)
+        length = jnp.asarray(self._dt if dt is None else dt, float)
         begins = jnp.asarray(starts_episode, bool)
         return self._step(belief, before, push, after, length, begins)
 

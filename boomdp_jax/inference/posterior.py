@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib
-import importlib.metadata
 import os
 from collections.abc import Iterable
 from typing import Any
@@ -14,10 +13,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from boomdp_jax.core.arrays import FloatScalar, Key
+from boomdp_jax.core.checked_input import whole_number
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.body_numbers import inferred_numbers
 from boomdp_jax.inference.contact_numbers import report_collisions
+from boomdp_jax.inference.identity_record import as_record
 from boomdp_jax.inference.posterior_file import (
+    library_versions,
     read_posterior_file,
     write_posterior_file,
 )
@@ -33,41 +35,14 @@ from boomdp_jax.inference.posterior_report import (
 from boomdp_jax.inference.random_motion import add_impulse, add_reading_noise
 from boomdp_jax.inference.summary import plain
 from boomdp_jax.physics import step
+from boomdp_jax.physics.arguments import checked_state, checked_wrench
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
 from boomdp_jax.physics.state import State
 
 
-class Record(dict):
-    """A dictionary that compares and hashes by identity, as static fields must."""
-
-    __hash__ = object.__hash__
-
-    def __eq__(self, other: object) -> bool:
-        return self is other
-
-    def __ne__(self, other: object) -> bool:
-        return self is not other
-
-
-def _record(value: dict) -> Record:
-    return value if isinstance(value, Record) else Record(value)
-
-
 def _scalar(value: float | Array) -> FloatScalar:
     return jnp.asarray(value, float)
-
-
-def library_versions() -> dict[str, str]:
-    """Versions of what computes a posterior, as result files record them."""
-    names = ("boomdp_jax", "jax", "jaxlib", "numpyro", "equinox", "numpy")
-    versions = {}
-    for name in names:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            versions[name] = "not installed"
-    return versions
 
 
 class Posterior(eqx.Module):
@@ -91,7 +66,7 @@ class Posterior(eqx.Module):
     """Prior draws, leading axis of their own, with every inferable slot active."""
     prior_noise_scale: Float[Array, "prior_draw body 4"]
     """Prior draws of `noise_scale`."""
-    inferred: dict[str, np.ndarray] = eqx.field(static=True, converter=_record)
+    inferred: dict[str, np.ndarray] = eqx.field(static=True, converter=as_record)
     """Which slots are inferred, not known, by kind: joints `[joint]`, wheel `[body,
     wheel]`, ground `[body, ground]`."""
     spec: SceneSpec = eqx.field(static=True)
@@ -100,11 +75,11 @@ class Posterior(eqx.Module):
     """Log marginal likelihood; NaN where the method gives none."""
     diagnostics: dict = eqx.field(
         static=True,
-        converter=_record,
+        converter=as_record,
         default_factory=lambda: {"ok": True, "reasons": []},
     )
     """`ok`, `reasons`, and the numbers behind them."""
-    seconds: dict = eqx.field(static=True, converter=_record, default_factory=dict)
+    seconds: dict = eqx.field(static=True, converter=as_record, default_factory=dict)
     """Wall time spent on `compile` and on `run` [s]."""
     impulse_scale: Float[Array, "draw body 2"] | None = None
     """Sd of the change of velocity [m/s] and spin [rad/s] that every step starts with;
@@ -113,8 +88,16 @@ class Posterior(eqx.Module):
     """Prior draws of `impulse_scale`."""
     seed: int | None = eqx.field(static=True, default=None)
     versions: dict = eqx.field(
-        static=True, converter=_record, default_factory=library_versions
+        static=True, converter=as_record, default_factory=library_versions
     )
+
+    __hash__ = object.__hash__
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+    # Equinox's own bound methods compare every number, which fails while JAX traces.
+    __getattribute__ = object.__getattribute__
 
     @property
     def degrees_of_freedom(self) -> float | None:
@@ -189,11 +172,22 @@ class Posterior(eqx.Module):
         )
 
     def sample_indices(self, key: Key, num_samples: int) -> Int[Array, " sample"]:
-        """Draw places in the list of draws, by weight and independently."""
+        """Draw places in the list of draws, by weight and independently.
+
+        Raises:
+            ValueError: a number of samples that is no whole number or negative.
+        """
+        num_samples = whole_number("num_samples", num_samples, 0)
         return jax.random.categorical(key, self.log_weight, shape=(num_samples,))
 
     def sample_params(self, key: Key, num_samples: int) -> Params:
-        """Draw hypotheses by weight and independently, leading axis `num_samples`."""
+        """Draw hypotheses by weight and independently, leading axis `num_samples`.
+
+        Under `jax.jit` the number of samples is static.
+
+        Raises:
+            ValueError: a number of samples that is no whole number or negative.
+        """
         chosen = self.sample_indices(key, num_samples)
         return jax.tree.map(lambda leaf: leaf[chosen], self.params)
 
@@ -202,9 +196,11 @@ class Posterior(eqx.Module):
 
         The draws that are kept have equal weights; with fewer effective draws than
         asked for, some occur more than once.
+
+        Raises:
+            ValueError: a number of draws that is no whole number or under one.
         """
-        if num_draws < 1:
-            raise ValueError(f"num_draws: expected at least 1, got {num_draws}")
+        num_draws = whole_number("num_draws", num_draws, 1)
         weights = self.weights
         num_draws = min(num_draws, self.num_draws)
         if num_draws == self.num_draws and np.ptp(weights) < 1e-6 / num_draws:
@@ -257,7 +253,12 @@ class Posterior(eqx.Module):
 
         Returns:
             A reading of the next state.
+
+        Raises:
+            ValueError: no state, or one or a wrench of another shape.
         """
+        state = checked_state(self.spec.num_bodies, state)
+        wrench = checked_wrench(self.spec.num_bodies, wrench)
         draw_key, noise_key, kick_key = jax.random.split(key, 3)
         chosen = self.sample_indices(draw_key, 1)[0]
         params, noise_scale, impulse_scale = jax.tree.map(
@@ -273,7 +274,10 @@ class Posterior(eqx.Module):
         return add_reading_noise(noise_key, next_state, *law)
 
     def predict(
-        self, history: History, horizons: Iterable[int] = (1, 10, 50), **options: Any
+        self,
+        history: History,
+        horizons: int | Iterable[int] = (1, 10, 50),
+        **options: Any,
     ) -> dict:
         """Score predictions of held-out motion; see `inference.predict.predict`."""
         from boomdp_jax.inference.predict import predict

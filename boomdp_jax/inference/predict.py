@@ -9,6 +9,7 @@ the reading at the end will err.
 import functools
 import math
 from collections.abc import Iterable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from boomdp_jax.core.arrays import Key
+from boomdp_jax.core.checked_input import whole_number
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.random_motion import add_impulse, add_reading_noise
@@ -33,7 +35,7 @@ _STARTS_AT_ONCE = 16
 def predict(
     posterior: Posterior,
     history: History,
-    horizons: Iterable[int] = (1, 10, 50),
+    horizons: int | Iterable[int] = (1, 10, 50),
     *,
     num_draws: int = 128,
     key: Key | None = None,
@@ -48,7 +50,7 @@ def predict(
     Args:
         posterior: what is believed.
         history: readings and wrenches that it has not seen.
-        horizons: steps ahead.
+        horizons: steps ahead, one number or several.
         num_draws: draws rolled out from each start.
         key: random key; default: that of seed 0.
 
@@ -61,19 +63,19 @@ def predict(
         be scored. By horizon, `num_starts`: rows that were predicted from.
 
     Raises:
-        ValueError: a horizon under one, too few draws, or another number of bodies.
+        ValueError: a horizon that is no whole number or under one, too few draws,
+            another number of bodies, or a history without rows.
     """
-    horizons = sorted({int(horizon) for horizon in horizons})
-    if not horizons or horizons[0] < 1:
-        raise ValueError(f"horizons: expected steps of at least 1, got {horizons}")
-    if num_draws < 2:
-        raise ValueError(f"num_draws: expected at least 2, got {num_draws}")
+    horizons = _sorted_horizons(horizons)
+    num_draws = whole_number("num_draws", num_draws, 2)
     num_bodies = len(posterior.spec.bodies)
     if history.num_bodies != num_bodies:
         raise ValueError(
             f"history: expected {num_bodies} bodies as in the scene, got "
             f"{history.num_bodies}"
         )
+    if not np.any(history.mask):
+        raise ValueError("history: expected at least one row, got none")
     key = jax.random.key(0) if key is None else key
     kept = posterior.thin(num_draws)
     scene = posterior.spec.scene
@@ -99,6 +101,16 @@ def predict(
             report[str(horizon)] = _score(at_horizon, table, horizon, is_static)
     counts = {str(h): len(usable_starts(table, h, is_static)) for h in horizons}
     return plain({"schema": SCHEMA, "horizons": report, "num_starts": counts})
+
+
+def _sorted_horizons(horizons: Any) -> list[int]:
+    """Each horizon once, the nearest first."""
+    is_one = not isinstance(horizons, Iterable) or getattr(horizons, "shape", 0) == ()
+    given = [horizons] if is_one else list(horizons)
+    whole = [whole_number("horizons", each, 1) for each in given]
+    if not whole:
+        raise ValueError("horizons: expected steps of at least 1, got none")
+    return sorted(set(whole))
 
 
 def sample_readings(

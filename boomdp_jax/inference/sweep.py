@@ -34,6 +34,9 @@ from boomdp_jax.physics.scene_spec import SceneSpec
 SCHEMA = "boomdp-sweep-1"
 UNIT_SCHEMA = "boomdp-sweep-unit-1"
 
+Recording = History | str | os.PathLike
+"""Of one object: itself, or its file."""
+
 _MANIFEST = "sweep.json"
 # Fewest rows that a history is padded to.
 _LEAST_ROWS = 4
@@ -42,7 +45,7 @@ _LEAST_ROWS = 4
 def infer_sweep(
     key: Key,
     specs: SceneSpec | Sequence[SceneSpec],
-    histories: Sequence[History | str | os.PathLike],
+    histories: Recording | Sequence[Recording],
     out_dir: str | os.PathLike,
     *,
     shard: tuple[int, int] = (0, 1),
@@ -61,7 +64,7 @@ def infer_sweep(
         key: random key; the key of a unit is folded in from its number.
         specs: one scene for all, or one for each history.
         histories: recordings, or files of the form `planar-transitions-1`, which are
-            read when their unit's turn comes.
+            read when their unit's turn comes; a single one is a list of one.
         out_dir: folder to write to; made if its parent is there.
         shard: (i, n): do units i, i + n, i + 2 n and so on.
         batch: objects of one unit, inferred in one compiled call.
@@ -93,7 +96,7 @@ def infer_sweep(
 def begin_sweep(
     key: Key,
     specs: SceneSpec | Sequence[SceneSpec],
-    histories: Sequence[History | str | os.PathLike],
+    histories: Recording | Sequence[Recording],
     out_dir: str | os.PathLike,
     *,
     batch: int = 16,
@@ -111,7 +114,7 @@ def begin_sweep(
     Args:
         key: as in `infer_sweep`, as are all others.
         specs: one scene for all, or one for each history.
-        histories: recordings, or files.
+        histories: recordings, or files, or a single one.
         out_dir: folder to write to.
         batch: objects of one unit.
         num_rows: how many rows of each file to use.
@@ -138,6 +141,8 @@ def begin_sweep(
     choose_likelihood(likelihood, horizon, method=method, outliers="none")
     if batch < 1:
         raise ValueError(f"batch: expected at least 1, got {batch}")
+    if isinstance(histories, History | str | os.PathLike):
+        histories = [histories]
     if not histories:
         raise ValueError("histories: expected at least one, got none")
     if isinstance(specs, SceneSpec):
@@ -179,7 +184,7 @@ class Sweep:
 
     folder: Path
     specs: tuple[SceneSpec, ...]
-    histories: tuple[History | str | os.PathLike, ...]
+    histories: tuple[Recording, ...]
     words: tuple[int, ...]
     """Of the random key."""
     batch: int

@@ -59,8 +59,9 @@ class BraxTask:
                 task's wrenches.
 
         Raises:
-            ValueError: from `continuous_actions`.
+            ValueError: no task; also from `continuous_actions`.
         """
+        _check_task(task)
         from brax.envs import base
 
         base.Env.register(BraxTask)
@@ -142,6 +143,13 @@ class BraxTask:
     def unwrapped(self) -> "BraxTask":
         """Itself."""
         return self
+
+
+def _check_task(task: object) -> None:
+    if not isinstance(task, AbstractEnvironment):
+        raise ValueError(
+            f"task: expected an environment, such as Pendulum(), got {task!r}"
+        )
 
 
 def register_brax_envs() -> None:

@@ -11,13 +11,16 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, PyTree
 
-from boomdp_jax.envs import EnvParams
+from boomdp_jax.envs import AbstractEnvironment, EnvParams
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.physics.params import Params
 
 
 def task_randomisation(
-    draws: Params | Posterior, *, num_draws: int | None = None
+    draws: Params | Posterior,
+    *,
+    num_draws: int | None = None,
+    task: AbstractEnvironment | None = None,
 ) -> Callable[[EnvParams, Array], tuple[EnvParams, PyTree]]:
     """Brax's `randomization_fn` that gives each world of a `BraxTask` a draw.
 
@@ -26,16 +29,24 @@ def task_randomisation(
             of it, whose draws are taken by weight.
         num_draws: how many of a posterior there are to choose from, at most; default:
             all.
+        task: what is trained; a posterior must then be of bodies with its names.
 
     Returns:
         A function of a world and of one random key for each environment. It returns
         the world with a leading axis on its physics, goal and starts being shared, and
-        its `in_axes`: give it to `train_ppo`, or to any trainer of brax.
+        its `in_axes`: give it to `train_ppo`, or to any trainer of brax. It refuses a
+        world of another number of bodies with a ValueError.
 
     Raises:
-        ValueError: hypotheses without leading axis, or with more than one.
+        ValueError: hypotheses without leading axis, or with more than one; a posterior
+            of other bodies than the task's.
     """
     if isinstance(draws, Posterior):
+        if task is not None and draws.spec.names != task.spec.names:
+            raise ValueError(
+                f"draws: expected bodies {', '.join(task.spec.names)[:200]}, got "
+                f"{', '.join(draws.spec.names)[:200]}"
+            )
         draws = draws.thin(draws.num_draws if num_draws is None else num_draws).params
     if draws.density.ndim != 2:
         raise ValueError(
@@ -45,6 +56,12 @@ def task_randomisation(
     physics, num = draws, draws.density.shape[0]
 
     def randomise(world: EnvParams, rng: Array) -> tuple[EnvParams, PyTree]:
+        num_bodies = world.physics.density.shape[-1]
+        if physics.density.shape[-1] != num_bodies:
+            raise ValueError(
+                f"draws: expected densities of {num_bodies} bodies, got "
+                f"{physics.density.shape[-1]}"
+            )
         chosen = jax.vmap(lambda key: jax.random.randint(key, (), 0, num))(rng)
         own = jax.tree.map(lambda leaf: leaf[chosen], physics)
         shared = jax.tree.map(lambda leaf: None, world)

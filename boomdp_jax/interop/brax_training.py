@@ -103,7 +103,7 @@ def train_ppo(
         **options,
     }
     if draws is not None:
-        chosen["randomization_fn"] = task_randomisation(draws)
+        chosen["randomization_fn"] = task_randomisation(draws, task=env.task)
     with _mended_trainer() as trainer:
         return TrainedPolicy(*trainer.train(env, num_timesteps, **chosen))
 

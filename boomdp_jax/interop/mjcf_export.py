@@ -102,13 +102,30 @@ def save_mjcf(
         path: where to; its folder must exist.
         time_step: MuJoCo's own [s].
         integrator: MuJoCo's name of it.
+
+    Raises:
+        ValueError: no path; also from `to_mjcf`.
+        OSError: the file cannot be written.
     """
+    _check_types(spec, params, path)
     text = to_mjcf(spec, params, time_step=time_step, integrator=integrator)
     atomic_write(path, text.encode())
 
 
+def _check_types(spec: object, params: object, path: object = "") -> None:
+    """Arguments are easily swapped."""
+    for name, value, kind, expected in (
+        ("spec", spec, SceneSpec, "a SceneSpec"),
+        ("params", params, Params, "Params"),
+        ("path", path, str | os.PathLike, "a path"),
+    ):
+        if not isinstance(value, kind):
+            raise ValueError(f"{name}: expected {expected}, got {type(value).__name__}")
+
+
 def _on_host(spec: SceneSpec, params: Params) -> Params:
     """The hypothesis in double precision, checked."""
+    _check_types(spec, params)
     if params.density.ndim != 1:
         raise ValueError(
             f"params: expected one hypothesis, got axes {params.density.shape[:-1]} of "

@@ -6,7 +6,9 @@ import reprlib
 from collections.abc import Collection
 from typing import NoReturn
 
+import jax
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Float
 
 MAX_NUMBER = 1e15
@@ -27,6 +29,30 @@ def refuse(where: str, expected: str, got: object) -> NoReturn:
         ValueError: always.
     """
     raise ValueError(f"{where}: expected {expected}, got {reprlib.repr(got)}")
+
+
+def in_terms_of_json(value: object) -> object:
+    """Replace arrays and NumPy's numbers by what a JSON file would hold.
+
+    Args:
+        value: anything; objects and lists are looked into.
+
+    Returns:
+        The same with lists for arrays and tuples, and Python's numbers and flags for
+        those of NumPy; what is neither stays.
+    """
+    if isinstance(value, jax.Array) and not isinstance(value, Tracer):
+        value = np.asarray(value)
+    if isinstance(value, dict):
+        return {key: in_terms_of_json(inner) for key, inner in value.items()}
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        return in_terms_of_json(value[()])
+    if isinstance(value, list | tuple | np.ndarray):
+        return [in_terms_of_json(inner) for inner in value]
+    for kind, plain in ((np.bool_, bool), (np.integer, int), (np.floating, float)):
+        if isinstance(value, kind):
+            return plain(value)
+    return value
 
 
 def read_object(

@@ -26,6 +26,7 @@ from boomdp_jax.physics.scene_arrays import (
 )
 from boomdp_jax.physics.scene_fields import (
     check_finite,
+    in_terms_of_json,
     read_count,
     read_flag,
     read_list,
@@ -222,7 +223,8 @@ def scene_spec_from_dict(content: object, source: str = "scene") -> SceneSpec:
     """Read a scene from what its JSON file holds.
 
     Args:
-        content: an object of the schema `planar-scene-1`.
+        content: an object of the schema `planar-scene-1`; arrays may stand for lists,
+            and NumPy's numbers for numbers.
         source: name of the file, for messages.
 
     Returns:
@@ -231,6 +233,12 @@ def scene_spec_from_dict(content: object, source: str = "scene") -> SceneSpec:
     Raises:
         ValueError: one line with file, body and field, what was expected, what was got.
     """
+    try:
+        content = in_terms_of_json(content)
+    except RecursionError as error:
+        raise ValueError(
+            f"{source}: expected an object, got one nested too deep"
+        ) from error
     if not isinstance(content, dict):
         refuse(source, "an object", content)
     if content.get("schema") != SCENE_SCHEMA:
@@ -284,6 +292,8 @@ def _read_unknown_numbers(caps: dict, where: str) -> frozenset[str]:
     """Names of numbers of bodies that are to be inferred."""
     numbers = read_list(caps.get("actuator", []), f"{where}.actuator")
     for number in numbers:
+        if numbers.count(number) > 1:
+            refuse(f"{where}.actuator", "names that differ", f"{number} twice")
         if number not in ACTUATOR_NUMBERS:
             expected = f"a list of some of {', '.join(ACTUATOR_NUMBERS)}"
             refuse(f"{where}.actuator", expected, number)

@@ -11,11 +11,17 @@ do not allow: a pinned body stays on its pin however hard it is shaken.
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar, Key
+from boomdp_jax.physics.arguments import (
+    checked_length,
+    checked_state,
+    checked_wrenches,
+)
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State, state_from_array
@@ -65,14 +71,14 @@ def simulate(
         all with a leading time axis.
 
     Raises:
-        ValueError: process noise for another number of bodies than the scene has.
+        TypeError: a state that is none.
+        ValueError: a state, wrenches, lengths or noise of another shape; noise below
+            zero, where it is known yet.
     """
+    state = checked_state(scene.num_bodies, state)
+    wrenches = checked_wrenches(scene.num_bodies, wrenches)
     num_bodies = scene.num_bodies
-    if noise.process.shape not in ((3,), (num_bodies, 3)):
-        raise ValueError(
-            f"Process noise has shape {noise.process.shape}; give one row of 3 for all "
-            f"bodies or one for each of the scene's {num_bodies}."
-        )
+    _check_noise(noise, num_bodies)
     process_key, observation_key = jax.random.split(key)
     moves = 1.0 - scene.is_static.astype(state.pose.dtype)
     process = jnp.broadcast_to(noise.process, (num_bodies, 3)) * moves[:, None]
@@ -84,9 +90,33 @@ def simulate(
     return states, state_from_array(states.array + errors * scale[None]), info
 
 
+def _check_noise(noise: SimulationNoise, num_bodies: int) -> None:
+    if jnp.shape(noise.process) not in ((3,), (num_bodies, 3)):
+        raise ValueError(
+            f"Process noise has shape {jnp.shape(noise.process)}; give one row of 3 "
+            f"for all bodies or one for each of the scene's {num_bodies}."
+        )
+    if jnp.shape(noise.observation) != (4,):
+        raise ValueError(
+            "noise.observation: expected shape (4,), of position, angle, velocity and "
+            f"spin; got {jnp.shape(noise.observation)}"
+        )
+    for name in ("process", "observation"):
+        scale = getattr(noise, name)
+        if not isinstance(scale, jax.core.Tracer) and not np.all(
+            np.asarray(scale) >= 0
+        ):
+            raise ValueError(
+                f"noise.{name}: expected standard deviations of at least 0; got "
+                f"{np.asarray(scale)}"
+            )
+
+
 def _advance_all(scene, params, state, wrenches, shakes, dt) -> tuple[State, StepInfo]:
     """Step by step, each with a change of twist before it."""
-    length = jnp.asarray(scene.dt if dt is None else dt, state.pose.dtype)
+    length = checked_length(
+        scene.dt if dt is None else dt, wrenches.shape[0], state.pose.dtype
+    )
     is_constant = length.ndim == 0
     constant = None
     if scene.collides is None and is_constant:

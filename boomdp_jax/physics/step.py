@@ -54,6 +54,12 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from boomdp_jax.physics.actuator import applied, without_actuator
+from boomdp_jax.physics.arguments import (
+    checked_length,
+    checked_state,
+    checked_wrench,
+    checked_wrenches,
+)
 from boomdp_jax.physics.center_of_mass import (
     about_center,
     state_of_center,
@@ -101,7 +107,13 @@ def step(
 
     Returns:
         The next state, and what there is to report.
+
+    Raises:
+        TypeError: a state that is none.
+        ValueError: a state or a wrench of another shape.
     """
+    state = checked_state(scene.num_bodies, state)
+    wrench = checked_wrench(scene.num_bodies, wrench)
     length = jnp.asarray(scene.dt if dt is None else dt, state.pose.dtype)
     return _step_of(scene, params, length)(state, wrench, cache)
 
@@ -156,8 +168,16 @@ def rollout(
 
     Returns:
         The states after each step and their reports, with a leading time axis.
+
+    Raises:
+        TypeError: a state that is none.
+        ValueError: a state, wrenches or lengths of another shape.
     """
-    length = jnp.asarray(scene.dt if dt is None else dt, state.pose.dtype)
+    state = checked_state(scene.num_bodies, state)
+    wrenches = checked_wrenches(scene.num_bodies, wrenches)
+    length = checked_length(
+        scene.dt if dt is None else dt, wrenches.shape[0], state.pose.dtype
+    )
     if params.actuator is not None:
         wrenches = jax.vmap(lambda wrench: applied(params, wrench, scene.is_static))(
             wrenches

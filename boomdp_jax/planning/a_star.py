@@ -27,6 +27,7 @@ from boomdp_jax.planning.problem import (
     RewardFn,
     TransitionFn,
     check_positive,
+    check_state,
     make_problem,
 )
 
@@ -128,6 +129,7 @@ def a_star(
             not a vector, another number of cell sizes than of coordinates, no action, a
             discount outside (0, 1].
     """
+    check_state(state)
     problem = make_problem(
         transition_fn,
         reward_fn,

@@ -31,6 +31,7 @@ from boomdp_jax.planning.problem import (
     RewardFn,
     TransitionFn,
     check_positive,
+    check_state,
     make_problem,
 )
 from boomdp_jax.planning.rollouts import check_number, draw_rollouts, read_inputs
@@ -97,6 +98,7 @@ def cross_entropy_method(
         ValueError: a number outside its range, actions, weights or a previous plan that
             do not fit.
     """
+    check_state(state)
     problem = make_problem(
         transition_fn,
         reward_fn,

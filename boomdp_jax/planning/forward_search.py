@@ -25,6 +25,7 @@ from boomdp_jax.planning.problem import (
     RewardFn,
     TransitionFn,
     check_positive,
+    check_state,
     make_problem,
 )
 from boomdp_jax.planning.return_bounds import BoundFn, make_bounds
@@ -121,6 +122,7 @@ def forward_search_sparse_sampling(
         ValueError: a count that is not positive, bounds missing or in the wrong order,
             no action, a discount outside (0, 1].
     """
+    check_state(state)
     problem = make_problem(
         transition_fn,
         reward_fn,

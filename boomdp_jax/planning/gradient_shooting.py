@@ -32,6 +32,7 @@ from boomdp_jax.planning.problem import (
     RewardFn,
     TransitionFn,
     check_positive,
+    check_state,
     make_problem,
 )
 from boomdp_jax.planning.rollouts import (
@@ -94,6 +95,7 @@ def gradient_shooting(
         ValueError: a number outside its range, actions, weights or a previous plan that
             do not fit.
     """
+    check_state(state)
     problem = make_problem(
         transition_fn,
         reward_fn,

@@ -37,6 +37,7 @@ from boomdp_jax.planning.problem import (
     RewardFn,
     TransitionFn,
     check_positive,
+    check_state,
     make_problem,
 )
 from boomdp_jax.planning.rollouts import Rollouts, draw_rollouts, read_inputs
@@ -98,6 +99,7 @@ def mctx_search(
         ValueError: a count that is not positive, a discount outside (0, 1], another
             policy, actions or weights that do not fit.
     """
+    check_state(state)
     problem = make_problem(
         transition_fn,
         reward_fn,

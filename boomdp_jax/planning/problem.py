@@ -17,7 +17,9 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from boomdp_jax.core.arrays import FloatScalar, Key
@@ -80,7 +82,7 @@ class Problem(eqx.Module):
             gain = jnp.asarray(self.reward_fn(hypothesis, state, action, moved))
             _check_scalar("reward_fn", gain)
             _check_scalar("transition_fn: done", jnp.asarray(done))
-            moved = jax.tree.map(lambda new, old: new.astype(old.dtype), moved, state)
+            moved = jax.tree.map(_as_before, moved, state)
             if done is False:
                 # An episode without an end needs no looking whether it is over.
                 return (moved, reward + alive * gain, alive * self.discount), None
@@ -172,6 +174,42 @@ def check_positive(name: str, count: Any) -> None:
     """Raise unless a static count is a positive integer."""
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise ValueError(f"{name}: expected a positive integer; got {count!r}")
+
+
+def check_state(state: PyTree) -> None:
+    """Raise unless all numbers of a state are finite, where they are known yet.
+
+    Args:
+        state: where to plan from.
+
+    Raises:
+        ValueError: one is not; nothing that follows from it could be compared.
+    """
+    for path, leaf in jax.tree_util.tree_leaves_with_path(state):
+        if isinstance(leaf, jax.core.Tracer) or not _is_inexact(leaf):
+            continue
+        if not np.all(np.isfinite(leaf)):
+            name = jax.tree_util.keystr(path)
+            raise ValueError(
+                f"state{name}: expected finite numbers to plan from; got "
+                f"{np.array2string(np.asarray(leaf), threshold=12)}"
+            )
+
+
+def _is_inexact(leaf: Any) -> bool:
+    return jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)
+
+
+def _as_before(new: Any, old: Array) -> Array:
+    """A part of the next state with the type that it has in the state before."""
+    new = jnp.asarray(new)
+    if _is_inexact(new) and not _is_inexact(old):
+        # Cut to whole numbers, the world would stand still.
+        raise TypeError(
+            f"state: transition_fn returns {new.dtype} for a part that is {old.dtype} "
+            "in the state to plan from; give it as floats"
+        )
+    return new.astype(old.dtype)
 
 
 def _check_scalar(name: str, value: Array) -> None:

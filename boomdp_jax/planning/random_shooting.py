@@ -23,6 +23,7 @@ from boomdp_jax.planning.problem import (
     RewardFn,
     TransitionFn,
     check_positive,
+    check_state,
     make_problem,
 )
 from boomdp_jax.planning.rollouts import draw_rollouts, read_inputs
@@ -72,6 +73,7 @@ def random_shooting(
         ValueError: a count that is not positive, a discount outside (0, 1], actions or
             weights that do not fit.
     """
+    check_state(state)
     problem = make_problem(
         transition_fn,
         reward_fn,

@@ -42,6 +42,7 @@ from boomdp_jax.planning.problem import (
     RewardFn,
     TransitionFn,
     check_positive,
+    check_state,
     make_problem,
 )
 from boomdp_jax.planning.replay import verified_values, with_previous
@@ -159,6 +160,7 @@ def sparse_sampling(
     )
     check_positive("num_hypotheses", num_hypotheses)
     check_positive("capacity", capacity)
+    check_state(state)
     problem = make_problem(
         transition_fn,
         reward_fn,

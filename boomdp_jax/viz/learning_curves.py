@@ -79,7 +79,9 @@ def draw_curves(
         ax.set_xscale("log")
     ax.set_xlabel("step" if sizes is None else "samples")
     ax.set_ylabel(ylabel)
-    ax.set_xlim(left=1 if sizes is None else sizes[0])
+    if bands:
+        # Without a curve the axis ends at 1, where it would begin.
+        ax.set_xlim(left=1 if sizes is None else sizes[0])
     ax.grid(color=GRID, linewidth=0.8)
     ax.set_axisbelow(True)
     for side in ("top", "right"):

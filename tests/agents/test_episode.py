@@ -34,6 +34,7 @@ def test_who_knows_the_line_walks_it_at_once():
     assert record.num_done == 4
 
 
+@pytest.mark.slow
 def test_who_regresses_learns_the_line():
     """x' = x + u is linear, but for the ends."""
     task = LineWorld(num_steps=40)
@@ -48,6 +49,7 @@ def test_who_regresses_learns_the_line():
     assert again.num_done == 4
 
 
+@pytest.mark.slow
 def test_what_is_never_tried_is_never_learnt():
     """Nothing is known, so all actions look alike; the first only meets the end."""
     task = LineWorld(num_steps=20)
@@ -59,6 +61,7 @@ def test_what_is_never_tried_is_never_learnt():
     assert record.num_done == 20
 
 
+@pytest.mark.slow
 def test_who_tries_anything_has_a_drunkards_walk():
     """Its length is a chain's time to absorption, from the chain's own matrix."""
     task = LineWorld(num_steps=400)
@@ -124,6 +127,7 @@ def test_who_does_not_learn_is_unhurt_by_noise(ride):
     np.testing.assert_array_equal(noisy.action, record.action)
 
 
+@pytest.mark.slow
 def test_readings_have_the_noise_that_was_asked_for():
     """A table of what was learnt from, against what was."""
     task = LineWorld(num_steps=400)

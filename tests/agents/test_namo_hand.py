@@ -46,6 +46,7 @@ def told(row) -> tuple[int, int]:
     return round(float(row.before.pose[0, 2]) / 0.1), round(float(row.wrench[0, 2]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0, 1, 3, 4, 6])
 def test_what_was_felt_meets_the_poses_of_its_own_step(delay):
     hand = Hand(WORLD, delay)

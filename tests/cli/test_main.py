@@ -76,6 +76,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             "infer data.npz --scene scene.json --out no/post.npz",
             "no/post.npz: expected",
         ),
+        pytest.param(
+            "infer data.npz --scene scene.json --out /proc/post.npz",
+            "/proc/post.npz: expected a folder to write to, got one that takes no",
+            marks=pytest.mark.skipif(not Path("/proc").is_dir(), reason="no /proc"),
+        ),
         ("infer data.npz --scene scene.json --out .", ".: expected a file"),
         ("infer data.npz --scene scene.json --plot fig.doc", "fig.doc: expected a fig"),
         (

@@ -108,6 +108,7 @@ def test_each_episode_starts_from_the_initial_state(folder: Path):
     np.testing.assert_allclose(table.dt, [0.02, 0.02, 0.02, 0.04, 0.04, 0.04])
 
 
+@pytest.mark.slow
 def test_a_noisy_instant_is_read_once_and_episodes_start_afresh(folder: Path):
     num_rows = 4000
     episode = np.repeat([0, 1], num_rows // 2)
@@ -181,6 +182,7 @@ def test_a_motion_that_overflows_is_refused(
     assert not Path("out.npz").exists()
 
 
+@pytest.mark.slow
 def test_bodies_in_contact_move_as_in_a_rollout(folder: Path):
     scene = json.loads(Path("scene.json").read_text())
     scene["gravity"] = [0, -9.81]

@@ -1,5 +1,6 @@
 """Histories: padding, masks and chains of readings."""
 
+import jax
 import numpy as np
 import pytest
 
@@ -67,9 +68,41 @@ def test_an_empty_history_is_allowed():
         ({"action": np.full((5, 1, 3), np.nan)}, "action: expected finite wrenches"),
         ({"state": np.full((5, 1, 6), np.inf)}, "state: expected finite readings"),
         ({"dt": np.zeros(5)}, "dt: expected positive seconds"),
+        ({"dt": np.ones(3)}, r"dt: expected one number or shape \(5,\), got .*\(3,\)"),
+        ({"dt": np.ones((5, 1))}, r"dt: expected one number or shape \(5,\)"),
+        ({"dt": np.full(5, "a")}, "dt: expected real numbers, got an array of <U1"),
+        ({"action": np.full((5, 1, 3), 1j)}, "action: expected real .* complex128"),
+        ({"state": np.full((5, 1, 6), "a")}, "state: expected real numbers, .* <U1"),
         ({"capacity": 4}, "capacity: expected at least 5 rows, got 4"),
+        ({"capacity": True}, "capacity: expected a whole number, at least 0, got True"),
+        ({"point_frame": "bodyy"}, "^point_frame: expected world or body, got 'bodyy'"),
+        ({"episode": np.arange(5) + 0.5}, "episode: expected whole .*, got 0.5"),
+        ({"episode": np.full(5, np.nan)}, "episode: expected whole .*, got nan"),
+        ({"episode": np.arange(5) * 2**33}, "whole numbers of 32 bit, got 8589934592"),
+        ({"episode": np.full(5, "a")}, "episode: expected whole .* array of <U1"),
+        ({"episode": np.zeros(4)}, r"episode: expected shape \(5,\), got \(4,\)"),
+        ({"episode": np.array([0, 1, 0, 1, 0])}, "episode: .* taken up again"),
     ],
 )
 def test_bad_rows_are_refused(changes: dict, message: str):
     with pytest.raises(ValueError, match=message):
+        make_history(**{**_rows(), **changes})
+
+
+def test_episodes_of_whole_floats_are_kept():
+    history = make_history(**_rows(), episode=np.array([3.0, 3.0, 1.0, 1.0, 7.0]))
+    np.testing.assert_array_equal(history.episode, [3, 3, 1, 1, 7])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"state": np.full((5, 1, 6), 1e300)}, "state: .* fit float32, got .* row 0"),
+        ({"action": np.full((5, 1, 3), 1e39)}, "action: .* fit float32, got .* body 0"),
+        ({"dt": np.full(5, 1e39)}, "dt: expected positive seconds, got 1e"),
+        ({"dt": np.full(5, 1e-60)}, "dt: expected positive seconds, got 1e-60"),
+    ],
+)
+def test_what_overflows_in_the_cast_is_refused(changes: dict, message: str):
+    with jax.enable_x64(False), pytest.raises(ValueError, match=message):
         make_history(**{**_rows(), **changes})

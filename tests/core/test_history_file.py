@@ -185,6 +185,7 @@ def _with(name: str, index: tuple, value: float) -> dict[str, np.ndarray]:
         ({"dt": np.asarray(np.nan)}, r"dt: expected positive seconds, got nan"),
         ({"dt": np.full(4, 0.02)}, r"dt: expected shape \[6\], got \[4\]"),
         ({"episode": np.zeros(6)}, r"episode: expected whole numbers"),
+        ({"episode": np.arange(6) * 2**33}, r"of 32 bit, got 8589934592"),
         ({"episode": np.array([0, 0, 1, 1, 0, 0])}, r"episode: .*taken up again"),
         ({"point": np.zeros((6, 2, 3))}, r"point: expected shape \[6, 2, 2\]"),
         (
@@ -232,3 +233,10 @@ def test_bad_rows_are_not_written(tmp_path: Path):
     with pytest.raises(ValueError, match="action: expected finite wrenches"):
         save_transitions(tmp_path / "data.npz", **rows)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_is_missing_is_named_by_the_file_given(tmp_path: Path):
+    path = tmp_path / "missing" / "data.npz"
+    with pytest.raises(FileNotFoundError) as caught:
+        save_history(path, make_history(**_rows()))
+    assert caught.value.filename == str(path)

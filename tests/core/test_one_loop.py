@@ -101,6 +101,7 @@ def test_reverse_mode(batched, numbers, close):
     close(one(*numbers), other(*numbers))
 
 
+@pytest.mark.slow
 def test_forward_mode(batched, numbers, close):
     one, other = (jax.jacfwd(batched(f), (0, 1)) for f in (looped, chain))
     close(one(*numbers), other(*numbers))
@@ -253,6 +254,7 @@ def _turn(shared, place):
     return one_loop(_turned, shared, place, num_passed=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_scalar", [False, True])
 def test_an_argument_handed_on_is_what_it_was(numbers, close, is_scalar):
     """Numbers and derivatives do not depend on who hands an argument on."""

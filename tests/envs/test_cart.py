@@ -80,6 +80,7 @@ def rides():
     return task, run(jnp.arange(12))
 
 
+@pytest.mark.slow
 def test_the_cart_is_never_in_a_wall(rides):
     task, (_, _, after, _) = rides
     poses = after.pose.reshape(-1, 3)
@@ -117,6 +118,7 @@ def test_a_wall_stops_a_step_that_would_jump_over_it():
     np.testing.assert_array_equal(end.twist, 0.0)
 
 
+@pytest.mark.slow
 def test_the_goal_ends_all_cost():
     task = Cart()
     params = task.default_params()

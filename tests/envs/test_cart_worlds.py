@@ -38,6 +38,7 @@ def after_a_step(name, speed, force=0.0):
     return c * x + s * y, c * y - s * x, spin
 
 
+@pytest.mark.slow
 def test_as_told_is_what_agents_believe():
     task = Cart()
     params = task.default_params()
@@ -49,6 +50,7 @@ def test_as_told_is_what_agents_believe():
         )
 
 
+@pytest.mark.slow
 def test_dry_wheels_and_floor_brake_at_a_constant_rate():
     friction = DRY_WHEEL[0] + DRY_FLOOR * MASS * STANDARD_GRAVITY
     for speed, force in ((1.2, 0.0), (0.5, 30.0)):

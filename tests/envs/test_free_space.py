@@ -80,6 +80,7 @@ def test_distance_to_outlines_is_that_of_the_minkowski_difference():
     )
 
 
+@pytest.mark.slow
 def test_overlaps_are_those_of_the_engine():
     random = np.random.default_rng(1)
     low, high = [0.1, 0.1, -4.0], [5.9, 3.9, 4.0]

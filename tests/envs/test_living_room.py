@@ -45,6 +45,7 @@ def still(pose):
     return state, jnp.zeros_like(pose), state
 
 
+@pytest.mark.slow
 def test_pieces_are_clear_of_each_other_where_they_start_and_where_they_belong():
     for seed in range(5):
         start = TASK.start(jax.random.key(seed), PARAMS)

@@ -31,6 +31,7 @@ def in_frame(frame: np.ndarray, pose: np.ndarray) -> np.ndarray:
     return np.array([offset.real, offset.imag, pose[2] - frame[2]])
 
 
+@pytest.mark.slow
 def test_grasps_are_free_and_their_gripper_faces_the_point():
     grasps = planner().grasps(0, START, BOX, BELOW)
     assert len(grasps) > 10

@@ -23,6 +23,7 @@ def held_action(task, action, num_steps, key):
     return jax.jit(lambda s: jax.lax.scan(one, s, None, length=num_steps)[1])(state)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [Pendulum, Acrobot])
 def test_starts_obey_the_pins(make):
     task = make()
@@ -77,6 +78,7 @@ def test_the_reward_is_the_angle_from_upright():
     np.testing.assert_allclose(np.cos(heading), -np.cos(np.asarray(reward)), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_tip_costs_its_depth():
     states, reward = held_action(Acrobot(), 1, 20, jax.random.key(6))
     pose = np.asarray(states.pose[:, 1])

@@ -39,6 +39,7 @@ def test_an_episode_ends_when_its_time_is_up(task):
     assert np.all(np.asarray(reward) < 0)
 
 
+@pytest.mark.slow
 def test_a_batch_of_worlds_is_a_loop_over_them(task):
     params = task.default_params()
     keys = jax.random.split(jax.random.key(1), 3)

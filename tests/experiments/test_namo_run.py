@@ -5,12 +5,13 @@ import pytest
 
 from boomdp_jax.cli.main import main
 from boomdp_jax.core.npz_file import read_npz
-from boomdp_jax.envs import is_solvable, random_room, story_room
+from boomdp_jax.envs import is_solvable, namo_rooms, random_room, story_room
 from boomdp_jax.envs.namo_rooms import is_closed
 from boomdp_jax.experiments import begin_namo
 from boomdp_jax.experiments.namo import true_numbers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_things", [2, 4, 8])
 def test_random_rooms_are_closed_and_can_be_solved(num_things):
     for seed in range(3):
@@ -19,6 +20,13 @@ def test_random_rooms_are_closed_and_can_be_solved(num_things):
         assert is_closed(room)
         assert is_solvable(room)
         assert random_room(seed, num_things) == room
+
+
+def test_a_search_without_end_is_given_up(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(namo_rooms, "_try_room", lambda *_: None)
+    status = main(["run", "namo", "--agent", "true", "--out", str(tmp_path / "run")])
+    assert status == 2
+    assert "seed: expected one with a room of 4 things" in capsys.readouterr().err
 
 
 def test_a_room_in_which_nothing_moves_cannot_be_solved():
@@ -57,7 +65,8 @@ def test_what_is_true_of_a_thing_alone_is_what_is_true_of_it_in_the_room():
         ({"agent": "lwr"}, "agent: expected one of true, .*got 'lwr'"),
         ({"num_seeds": 0}, "num_seeds: expected at least 1, got 0"),
         ({"room": "hall"}, "room: expected story or random, got 'hall'"),
-        ({"num_things": 1}, "num_things: expected at least 2, got 1"),
+        ({"num_things": 1}, "num_things: expected 2 to 12, got 1"),
+        ({"num_things": 30}, "num_things: expected 2 to 12, got 30"),
         ({"difficulty": 2.0}, r"difficulty: expected in \[0, 1\], got 2.0"),
     ],
 )
@@ -90,6 +99,14 @@ def test_the_command_line_writes_rooms_and_goes_on(tmp_path, capsys):
     [
         (["namo", "--steps", "5"], "--steps: expected none for namo, got 5"),
         (["cart", "--things", "3"], "--things: expected none for cart"),
+        (
+            ["namo", "--room", "story", "--things", "3"],
+            "--things: expected none with --room story, got 3",
+        ),
+        (
+            ["namo", "--room", "story", "--difficulty", "0"],
+            "--difficulty: expected none with --room story, got 0.0",
+        ),
     ],
 )
 def test_options_of_other_tasks_are_refused(extra, message, tmp_path, capsys):

@@ -33,6 +33,7 @@ def whole(tmp_path_factory):
     return run, run.collect()
 
 
+@pytest.mark.slow
 def test_results_have_a_row_for_each_seed(whole):
     run, results = whole
     assert results["reward"].shape == (3, STEPS)
@@ -59,6 +60,7 @@ def test_a_run_goes_on_to_the_same_bits(whole, tmp_path):
         np.testing.assert_array_equal(resumed[field], results[field])
 
 
+@pytest.mark.slow
 def test_shards_share_the_work(whole, tmp_path):
     _, results = whole
     for place in (1, 0):
@@ -126,6 +128,7 @@ def test_the_command_line_knows_the_same_names():
     assert cli.WORLDS == tuple(CART_WORLDS)
 
 
+@pytest.mark.slow
 def test_a_run_in_another_world_says_so(tmp_path):
     """In the box's world the outline is told wrong, and nothing else differs."""
     settings = {"num_seeds": 1, "num_steps": 3}

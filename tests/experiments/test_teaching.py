@@ -19,6 +19,7 @@ def line():
     return task, params, samples
 
 
+@pytest.mark.slow
 def test_samples_are_steps_of_the_world(line):
     _, _, samples = line
     assert samples.state.shape == (200, 1, 6)
@@ -28,6 +29,7 @@ def test_samples_are_steps_of_the_world(line):
     assert set(samples.state[:, 0, 0]) == {0.0, 1.0, 2.0, 3.0, 4.0}
 
 
+@pytest.mark.slow
 def test_samples_are_read_with_noise():
     task = LineWorld()
     scale = jnp.array([0.0, 0.0, 0.1, 0.3])
@@ -41,6 +43,7 @@ def test_samples_are_read_with_noise():
             assert abs(share - 1) < 4 / np.sqrt(2 * len(part))
 
 
+@pytest.mark.slow
 def test_what_was_taught_is_known_and_stays(line):
     """x' = x + u where the ends are far."""
     task, _, samples = line

@@ -68,6 +68,7 @@ def stacked(each: list):
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
 
 
+@pytest.mark.slow
 def test_steps_over_a_collision_agree_with_the_closed_form():
     tried = cases(1, 64)
     worlds, params = map(stacked, zip(*(scene_of(case) for case in tried), strict=True))
@@ -87,6 +88,7 @@ def test_steps_over_a_collision_agree_with_the_closed_form():
             assert miss[..., 5].max() < 2e-2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("touch", [-0.04, 0.02, 0.5, 0.98, 1.04])
 def test_neighbours_of_an_estimate_collide_when_it_does(touch):
     """What becomes of a state is smooth in it, wherever in a step it collides."""
@@ -123,6 +125,7 @@ def test_neighbours_of_an_estimate_collide_when_it_does(touch):
     assert miss[..., 3:5].max() < 2e-3
 
 
+@pytest.mark.slow
 def test_a_disc_bounces_off_a_wall():
     """Against a wall the closed form is that of one disc."""
     contact = {"friction": 0.2, "restitution": 0.6}
@@ -176,6 +179,7 @@ SHAPES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("first", "second"),
     [("disc", "disc"), ("disc", "box"), ("triangle", "box"), ("triangle", "disc")],

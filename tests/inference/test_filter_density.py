@@ -32,6 +32,7 @@ def density_of_box(history: History, mass: float) -> float:
     return float(filter_density(spec.scene, spec.params(), data, level()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mass", [MASS, 1.1 * MASS])
 def test_density_is_that_of_all_readings_together(mass):
     history = free_box(np.random.default_rng(0), 12)
@@ -39,6 +40,7 @@ def test_density_is_that_of_all_readings_together(mass):
     np.testing.assert_allclose(density_of_box(history, mass), expected, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_second_readings_and_gaps_are_taken_as_by_the_other_filter():
     """That one is checked against the joint density of such readings by itself."""
     history = free_box(np.random.default_rng(2), 10, is_chained=False, num_episodes=2)
@@ -82,6 +84,7 @@ def side_by_side(left: History, right: History) -> History:
     )
 
 
+@pytest.mark.slow
 def test_bodies_that_are_not_tied_are_independent():
     each = [free_box(np.random.default_rng(seed), 8) for seed in (4, 5)]
     spec = two_bodies([])

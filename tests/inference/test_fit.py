@@ -48,6 +48,7 @@ def random_points(targets, num):
     return index, structure, z
 
 
+@pytest.mark.slow
 def test_points_in_any_order_are_evaluated_as_alone(wheeled):
     index, structure, z = random_points(wheeled, 70)
     found = evaluate_points(wheeled, index, structure, z)
@@ -61,6 +62,7 @@ def test_points_in_any_order_are_evaluated_as_alone(wheeled):
     np.testing.assert_allclose(found.log_density, expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_one_step_gains_give_the_one_step_likelihood(wheeled):
     index, structure, z = random_points(wheeled, 6)
     found = evaluate_points(wheeled, index, structure, z)
@@ -117,6 +119,7 @@ def test_a_heading_that_changes_nothing_is_as_wide_as_half_a_turn(wheeled):
     assert np.linalg.eigvalsh(matrix[0])[0] > 0.9
 
 
+@pytest.mark.slow
 def test_climb_reaches_the_maximum_that_scipy_finds(box):
     start = make_fits(box, np.arange(2), np.zeros(2, int), np.array([[1.5], [-1.0]]))
     found = climb(box, start, 12)
@@ -161,6 +164,7 @@ def test_mass_is_found_as_closely_as_a_filter_can(box):
     assert np.all(sd < 0.7 / np.sqrt(matrix[:, 0, 0]))
 
 
+@pytest.mark.slow
 def test_gains_belong_to_their_structure(wheeled):
     num = wheeled.structures.shape[1]
     index, structure = np.repeat([0, 1], num), np.tile(np.arange(num), 2)

@@ -175,6 +175,7 @@ MISTAKES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MISTAKES)
 def test_planted_mistakes_are_caught(name):
     scores = joint_scores(MISTAKES[name])

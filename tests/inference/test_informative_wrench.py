@@ -7,7 +7,7 @@ import pytest
 from scipy import integrate, stats
 
 from boomdp_jax.inference.informative_wrench import informative_wrench
-from boomdp_jax.physics import empty_params
+from boomdp_jax.physics import State, empty_params
 from tests.inference.posteriors import draws_like, make_posterior, table_spec
 from tests.inference.recordings import AREA, DT
 
@@ -49,6 +49,7 @@ def mutual_information(distance: float) -> float:
     return np.log(2.0) - integrate.quad(integrand, -12, 12)[0]
 
 
+@pytest.mark.slow
 def test_two_densities_are_told_apart_as_theory_says():
     posterior = two_boxes()
     force = np.array([0.0, 0.15, 0.3, 0.6, 5.0])
@@ -77,6 +78,7 @@ def test_two_densities_are_told_apart_as_theory_says():
     np.testing.assert_allclose(found.structure_gain, 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_push_across_a_wheel_tells_whether_there_is_one():
     posterior = two_structures()
     candidates = jnp.asarray([[[5.0, 0.0, 0.0]], [[0.0, 5.0, 0.0]]])
@@ -102,6 +104,7 @@ def test_a_push_across_a_wheel_tells_whether_there_is_one():
         (np.zeros((0, 1, 3)), {}, "with one at least"),
         (np.full((1, 1, 3), np.nan), {}, "finite wrenches, got one at 0"),
         (np.zeros((1, 1, 3)), {"num_steps": 0}, "num_steps: expected at least 1"),
+        (np.zeros((1, 1, 3)), {"num_steps": True}, "num_steps: expected a whole"),
         (np.zeros((1, 1, 3)), {"num_draws": 0}, "num_draws: expected at least 1"),
     ],
 )
@@ -112,3 +115,23 @@ def test_bad_input_is_refused(candidates, options, message):
         informative_wrench(
             jax.random.key(0), posterior, state, jnp.asarray(candidates), **options
         )
+
+
+NOWHERE = np.array([[0.0, np.nan, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        ((np.zeros((2, 3)), np.zeros((2, 3))), r"state.pose: .*\(1, 3\).*\(2, 3\)"),
+        ((NOWHERE, np.zeros((1, 3))), "state: body 'table': expected finite"),
+        ((np.zeros((1, 3)), NOWHERE), "state: body 'table': expected finite"),
+        (np.zeros((1, 6)), "state: expected a State, got ndarray; state_from_array"),
+    ],
+)
+@pytest.mark.usefixtures("no_type_checks")
+def test_a_bad_state_is_refused(state, message):
+    state = State(*state) if isinstance(state, tuple) else state
+    candidates = np.zeros((1, 1, 3))
+    with pytest.raises((TypeError, ValueError), match=message):
+        informative_wrench(jax.random.key(0), two_boxes(), state, candidates)

@@ -216,6 +216,7 @@ def test_without_data_the_concentration_keeps_its_gamma_prior(sampler):
     check_chain_means(values, expected)
 
 
+@pytest.mark.slow
 def test_one_object_keeps_its_own_posterior():
     reading = np.array([[0.8, -0.4]])
     evidence = np.array([[0.0, 0.7]])
@@ -299,6 +300,7 @@ def headings() -> KindData:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "sampler", ["collapsed", pytest.param("sticks", marks=pytest.mark.slow)]
 )

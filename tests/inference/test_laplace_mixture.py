@@ -57,6 +57,7 @@ def student(mixture, component, coordinates):
     return stats.multivariate_t(mean, shape, df=FREEDOM)
 
 
+@pytest.mark.slow
 def test_log_density_is_a_mixture_of_student_densities(precision):
     target = make_target(NoLikelihood())
     mixture = random_mixture(target)
@@ -78,6 +79,7 @@ def test_log_density_is_a_mixture_of_student_densities(precision):
     assert worst < precision.choose(single=2e-5, double=1e-11)
 
 
+@pytest.mark.slow
 def test_conditional_of_a_slot_is_joint_over_marginal(precision):
     target = make_target(NoLikelihood())
     mixture = random_mixture(target, num_each=1)
@@ -129,6 +131,7 @@ def test_conditional_weighs_components_by_what_is_kept():
     np.testing.assert_allclose(float(found), expected, atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("has_prior_part", [False, True])
 def test_draws_follow_the_density_with_angles(has_prior_part):
     """Averages of f(x) p(x) / q(x) over draws from q are prior expectations of f."""
@@ -168,6 +171,7 @@ def test_draws_follow_the_density_with_angles(has_prior_part):
     assert np.max(np.abs(scores)) < two_sided(FALSE_ALARM, len(scores))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prior_share", [1e-30, 0.3])
 def test_slot_draws_follow_their_density(prior_share):
     target = make_target(NoLikelihood(), ANGLES)
@@ -224,6 +228,7 @@ def test_a_slot_without_components_is_drawn_from_the_prior():
     np.testing.assert_allclose(float(found), expected, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_slot_components_join_a_smaller_mode_with_the_prior():
     target = make_target(NoLikelihood())
     mixture = random_mixture(target, num_each=1)

@@ -6,6 +6,7 @@ import pytest
 from boomdp_jax.inference.layout import block_layout, structures
 from boomdp_jax.inference.prior import DEFAULT_PROBABILITY, read_prior
 from boomdp_jax.physics import scene_spec_from_dict
+from boomdp_jax.physics.constraint_spec import KINDS
 
 
 def spec(num_bodies, unknown, **fields):
@@ -80,9 +81,17 @@ def test_coordinates_of_slots_do_not_overlap():
     assert np.count_nonzero(layout.period()) == 4
 
 
-def test_too_many_structures_are_refused():
-    with pytest.raises(ValueError, match="expected at most 4096; lower the caps"):
-        listed(spec(4, {"revolute": 3, "wheel": 3, "ground": 3}))
+@pytest.mark.parametrize(
+    ("num_bodies", "unknown", "what"),
+    [
+        (1, {"revolute": 50}, "50 constraints .* expected at most 12"),
+        (1, dict.fromkeys(KINDS, 3), "18 constraints .* expected at most 12"),
+        (4, {"revolute": 3, "wheel": 3, "ground": 3}, "expected at most 4096"),
+    ],
+)
+def test_too_many_structures_are_refused(num_bodies, unknown, what):
+    with pytest.raises(ValueError, match=f"unknown: .*{what}; lower the caps"):
+        listed(spec(num_bodies, unknown))
 
 
 @pytest.mark.parametrize(

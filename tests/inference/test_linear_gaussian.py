@@ -113,6 +113,7 @@ def test_importance_evidence_agrees_with_closed_form(precision):
     np.testing.assert_allclose(np.sum(found.probability), 1.0, atol=rounding)
 
 
+@pytest.mark.slow
 def test_stated_errors_of_evidence_are_honest():
     target, design, data = make_problem(seed=1)
     log_evidence, _, means, covariances = closed_form(design, data)
@@ -155,6 +156,7 @@ def test_laplace_mixture_is_exact_for_a_gaussian(precision):
         )
 
 
+@pytest.mark.slow
 def test_refined_weights_are_structure_probabilities():
     target, design, data = make_problem(seed=1)
     _, probability, means, covariances = closed_form(design, data)

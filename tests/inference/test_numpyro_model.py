@@ -88,6 +88,7 @@ def lognormal(median, spread):
     return scipy.stats.lognorm(spread, scale=median)
 
 
+@pytest.mark.slow
 def test_prior_draws_follow_the_stated_distributions(prior):
     mass = prior["table.mass"]
     np.testing.assert_allclose(mass, prior["table.density"] * 0.08)
@@ -135,6 +136,7 @@ def test_anchors_are_scaled_by_reach_about_the_centre_of_the_path(spec, prior):
     assert passes(draws, lognormal(reach, 1.0))
 
 
+@pytest.mark.slow
 def test_sites_and_coordinates_give_the_same_hypothesis(model):
     (block,) = model.blocks
     coordinates = block.target.log_likelihood.coordinates
@@ -200,6 +202,7 @@ def test_integrated_over_the_noise_the_joint_density_is_the_targets(spec):
         assert total == pytest.approx(expected, rel=1e-8)
 
 
+@pytest.mark.slow
 def test_scalar_noise_is_one_normal_likelihood_over_all_that_was_read(spec):
     history = pushed(spec)
     free = make_model(spec, history, noise="scalar")
@@ -241,6 +244,7 @@ def test_missing_channels_do_not_count_and_angles_take_the_shorter_turn(spec):
     assert likelihood == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_prior_predictions_are_the_steps_of_the_drawn_hypothesis(spec):
     history = pushed(spec, num_rows=6)
     free = make_model(spec, history)
@@ -253,6 +257,7 @@ def test_prior_predictions_are_the_steps_of_the_drawn_hypothesis(spec):
     assert passes(scaled, scipy.stats.norm)
 
 
+@pytest.mark.slow
 def test_other_rows_are_predicted_from_their_own_states(spec):
     free = make_model(spec, pushed(spec))
     later = pushed(spec, num_rows=9, seed=1)
@@ -284,6 +289,7 @@ def test_handlers_and_svi_work(spec):
     assert moved != before["table.density_auto_loc"]
 
 
+@pytest.mark.slow
 def test_numbers_that_the_scene_gives_have_no_site():
     pin = {
         "type": "revolute",
@@ -305,6 +311,7 @@ def test_numbers_that_the_scene_gives_have_no_site():
     assert "table.revolute.anchor_b" not in tr
 
 
+@pytest.mark.slow
 def test_bodies_that_a_structure_does_not_tie_are_separate_blocks():
     spec = make_spec(names=("cart", "pole", "box"))
     history = pushed(spec)

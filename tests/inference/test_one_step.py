@@ -37,6 +37,7 @@ def test_marginal_likelihood_is_the_integral_over_the_noise_variance():
     assert float(log_marginal(statistics, scales)) == pytest.approx(np.log(expected))
 
 
+@pytest.mark.slow
 def test_noise_draws_follow_their_inverse_gamma_distribution():
     statistics = NoiseStatistics(jnp.full((1, 4), 30.0), jnp.full((1, 4), 2e-3))
     scales = jnp.full(4, 5e-3)

@@ -169,6 +169,7 @@ def test_the_marginal_likelihood_is_that_of_a_particle_filter():
     assert normal < found[1] - 1e3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_chained", [True, False])
 def test_both_filters_agree(is_chained):
     """One takes channels one by one, the other makes gains as well."""
@@ -231,6 +232,7 @@ def test_a_track_does_not_start_from_a_gross_error():
     assert float(plain.first_mask[0].sum()) == 6.0
 
 
+@pytest.mark.slow
 def test_noise_that_is_drawn_has_the_tails():
     """Share of draws beyond 4 scales; five standard errors of 60,000 draws."""
     state = State(jnp.zeros((10_000, 1, 3)), jnp.zeros((10_000, 1, 3)))

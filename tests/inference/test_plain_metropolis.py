@@ -46,6 +46,7 @@ def test_without_data_it_returns_the_prior(blank):
         assert np.all(np.abs(by_chain.mean(axis=0) - expected) < 5 * error)
 
 
+@pytest.mark.slow
 def test_the_best_draw_is_of_the_highest_density(blank):
     draws = jax.vmap(blank.draw)(jax.random.split(jax.random.key(1), 6))
     density = jax.vmap(blank.log_density)(draws)

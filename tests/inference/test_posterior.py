@@ -119,6 +119,17 @@ def test_thinning_to_more_draws_changes_nothing():
     assert posterior.thin(1000) is posterior
     with pytest.raises(ValueError, match="num_draws: expected at least 1, got 0"):
         posterior.thin(0)
+    with pytest.raises(ValueError, match=r"num_draws: expected a whole .*, got True"):
+        posterior.thin(True)
+
+
+def test_a_bad_number_of_samples_is_refused():
+    posterior, key = table_posterior(4), jax.random.key(0)
+    with pytest.raises(ValueError, match="num_samples: expected at least 0, got -1"):
+        posterior.sample_params(key, -1)
+    with pytest.raises(ValueError, match=r"num_samples: expected a whole .*, got True"):
+        posterior.sample_params(key, True)
+    assert posterior.sample_params(key, 0).density.shape[0] == 0
 
 
 def test_sampled_params_follow_the_weights():
@@ -130,6 +141,7 @@ def test_sampled_params_follow_the_weights():
     assert share == pytest.approx(0.75, abs=5 * (0.75 * 0.25 / 4000) ** 0.5)
 
 
+@pytest.mark.slow
 def test_a_transition_is_a_step_of_a_draw_plus_noise():
     noise = np.array([0.001, 0.002, 0.005, 0.01])
     mass = np.array([10.0, 20.0, 40.0]) * 0.24
@@ -177,3 +189,66 @@ def test_a_posterior_passes_through_jit():
     assert float(total(posterior)) == pytest.approx(expected)
     assert float(total(posterior)) == pytest.approx(expected)
     assert total._cache_size() == 1
+
+
+def test_methods_of_a_posterior_can_be_given_to_jit_and_vmap():
+    posterior, key = free_posterior([10.0, 20.0]), jax.random.key(0)
+    state, wrench = posterior.spec.initial_state(), jnp.ones((1, 3))
+    once = posterior.transition(key, state, wrench)
+    draw = jax.jit(posterior.transition)
+    for _ in range(2):
+        # As it stands, and while something around it is traced.
+        again = jax.jit(lambda: jax.jit(posterior.transition)(key, state, wrench))()
+        for found in (draw(key, state, wrench), again):
+            np.testing.assert_allclose(found.array, once.array, rtol=1e-6)
+    keys = jax.random.split(key, 3)
+    many = jax.jit(jax.vmap(posterior.transition, (0, None, None)))
+    assert many(keys, state, wrench).array.shape == (3, 1, 6)
+    sample = jax.jit(posterior.sample_params, static_argnums=1)
+    np.testing.assert_array_equal(
+        sample(key, 5).density, posterior.sample_params(key, 5).density
+    )
+
+
+def test_posteriors_compare_by_identity():
+    posterior, other = free_posterior([10.0]), free_posterior([10.0])
+    assert posterior != other
+    assert {posterior: 1}[posterior] == 1
+    key, state = jax.random.key(0), posterior.spec.initial_state()
+    heavy = free_posterior([1e6])
+    push = jnp.full((1, 3), 100.0)
+    found = [jax.jit(p.transition)(key, state, push).twist for p in (posterior, heavy)]
+    assert np.all(np.abs(found[0]) > 10 * np.abs(found[1]))
+
+
+ZEROS = np.zeros((1, 3))
+
+
+@pytest.mark.parametrize(
+    ("state", "wrench", "message"),
+    [
+        (np.zeros((1, 6)), ZEROS, "state: expected a State, got ndarray"),
+        ((ZEROS[0], ZEROS[0]), ZEROS, r"state.pose: expected shape \(1, 3\), one"),
+        ((ZEROS, np.zeros((2, 3))), ZEROS, r"state.twist: .* got \(2, 3\)"),
+        ((ZEROS, 1j * ZEROS), ZEROS, "state.twist: expected real .* complex128"),
+        ((ZEROS, ZEROS), ZEROS[0], r"wrench: expected shape .* got \(3,\)"),
+    ],
+)
+@pytest.mark.usefixtures("no_type_checks")
+def test_a_transition_of_something_else_is_refused(state, wrench, message):
+    state = State(*state) if isinstance(state, tuple) else state
+    with pytest.raises((TypeError, ValueError), match=message):
+        free_posterior([10.0]).transition(jax.random.key(0), state, wrench)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.usefixtures("no_type_checks")
+@pytest.mark.parametrize("dtype", [int, np.float64])
+def test_a_transition_takes_integers_and_numpy_without_a_warning(dtype):
+    with jax.enable_x64(False):
+        posterior, key = free_posterior([10.0]), jax.random.key(0)
+        state = State(np.zeros((1, 3), dtype), np.ones((1, 3), dtype))
+        found = posterior.transition(key, state, np.ones((1, 3), dtype))
+        assert found.pose.dtype == jnp.float32
+        # A fiftieth of a second at one metre a second.
+        np.testing.assert_allclose(found.pose, 0.02, atol=0.05)

@@ -154,3 +154,10 @@ def test_another_number_of_bodies_is_refused(saved):
     scene["bodies"].append({**scene["bodies"][0], "name": "chair"})
     edit_header(saved, scene=scene)
     assert "expected draws of 2 bodies as in the scene, got 1" in refusal(saved)
+
+
+def test_a_folder_that_is_missing_is_named_by_the_file_given(tmp_path):
+    path = tmp_path / "missing" / "post.npz"
+    with pytest.raises(FileNotFoundError) as caught:
+        table_posterior(4).save(path)
+    assert caught.value.filename == str(path)

@@ -67,6 +67,7 @@ def expected_sd(horizon):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("horizon", HORIZONS)
 def test_errors_are_those_of_the_readings(report, horizon):
     scores = report["horizons"][str(horizon)]
@@ -153,12 +154,22 @@ def test_a_horizon_longer_than_every_episode_is_null():
     }
 
 
+@pytest.mark.usefixtures("no_type_checks")
 def test_bad_requests_are_refused():
     state, action, next_state, episode = pushed_table(num_episodes=1)
     history = make_history(state, action, next_state, DT, episode=episode)
     posterior = free_posterior(10)
-    with pytest.raises(ValueError, match="horizons: expected steps of at least 1"):
+    with pytest.raises(ValueError, match="horizons: expected at least 1, got 0"):
         predict(posterior, history, (0, 5))
+    with pytest.raises(ValueError, match=r"horizons: expected a whole .*, got 1\.5"):
+        predict(posterior, history, (1.5,))
+    with pytest.raises(ValueError, match=r"horizons: expected steps .*, got none"):
+        predict(posterior, history, ())
+    empty = make_history(state[:0], action[:0], next_state[:0], DT)
+    with pytest.raises(ValueError, match="history: expected at least one row, got n"):
+        predict(posterior, empty)
+    with pytest.raises(ValueError, match="history: expected at least one row, got n"):
+        predict(posterior, empty.padded(4))
     with pytest.raises(ValueError, match="num_draws: expected at least 2, got 1"):
         predict(posterior, history, num_draws=1)
     params = draws_like(empty_params(3), 5)
@@ -172,3 +183,15 @@ def test_the_same_key_gives_the_same_numbers(report):
     history = make_history(state, action, next_state, DT, episode=episode)
     again = free_posterior().predict(history, HORIZONS, num_draws=NUM_DRAWS)
     assert again == report
+
+
+@pytest.mark.usefixtures("no_type_checks")
+def test_one_horizon_needs_no_list():
+    state, action, next_state, episode = pushed_table()
+    history = make_history(
+        state, action, next_state, DT, episode=episode, capacity=CAPACITY
+    )
+    posterior = free_posterior()
+    expected = posterior.predict(history, {1}, num_draws=NUM_DRAWS)
+    for one in (1, np.array(1), [1, 1]):
+        assert posterior.predict(history, one, num_draws=NUM_DRAWS) == expected

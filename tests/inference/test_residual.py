@@ -97,6 +97,7 @@ WRONG = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(WRONG))
 def test_a_law_that_is_added_is_named_with_its_coefficient(name):
     """Coefficients within four sds, which the noise of the motion makes wide."""
@@ -118,6 +119,7 @@ def test_a_free_box_follows_no_further_law():
         assert min(white.values()) > 1e-4
 
 
+@pytest.mark.slow
 def test_the_law_is_found_on_the_body_that_has_it():
     """Two bodies of one block, one of them pushed off its centre of mass."""
     rng = np.random.default_rng(3)
@@ -133,6 +135,7 @@ def test_the_law_is_found_on_the_body_that_has_it():
     assert others[0].fit.log_bayes_factor < np.log(2000.0)
 
 
+@pytest.mark.slow
 def test_positions_alone_and_steps_of_any_length_will_do():
     rng = np.random.default_rng(4)
     dt = rng.uniform(0.015, 0.04, size=100)

@@ -81,6 +81,7 @@ def test_a_weld_is_the_pose_of_its_body():
     np.testing.assert_allclose(found, z[part(block, "weld")], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_drawer_turned_by_pi_is_the_same_drawer():
     block = seen(scene(unknown=UNKNOWN))
     z = np.random.default_rng(2).uniform(-0.5, 0.5, block.layout.dim)

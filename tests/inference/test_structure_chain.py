@@ -289,6 +289,7 @@ def test_run_chains_makes_the_same_moves_as_single_steps():
     )
 
 
+@pytest.mark.slow
 def test_same_key_gives_same_bits():
     target, mixture, *_ = linear_case()
     first, _ = run_chains(jax.random.key(2), target, mixture, **RUN)
@@ -298,6 +299,7 @@ def test_same_key_gives_same_bits():
     assert not np.array_equal(first.z, other.z)
 
 
+@pytest.mark.slow
 def test_a_likelihood_that_fails_is_never_visited():
     class Failing(eqx.Module):
         def __call__(self, z, active):

@@ -101,6 +101,7 @@ def test_numpyro_single_chain_shows_progress_and_postprocesses(capsys):
     assert "jump" in kernel.get_diagnostics_str(mcmc.last_state)
 
 
+@pytest.mark.slow
 def test_a_structure_without_components_is_refused_by_the_kernel():
     target, mixture = linear_case()
     lacking = eqx.tree_at(

@@ -91,6 +91,7 @@ def test_evidence_agrees_with_the_closed_form(method):
     assert np.all(evidence.total_error < 0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", WITH_ERRORS)
 def test_draws_follow_the_posterior(method):
     _, truths = problem()

@@ -97,6 +97,7 @@ def assert_same_arrays(one: Path, other: Path, num_objects: int) -> None:
             assert array.tobytes() == right[name][key].tobytes(), (name, key)
 
 
+@pytest.mark.slow
 def test_shards_together_are_one_run(tmp_path: Path, cheap: list):
     spec, histories = table_spec(), recordings()
     key = jax.random.key(KEY)
@@ -110,6 +111,15 @@ def test_shards_together_are_one_run(tmp_path: Path, cheap: list):
     assert [len(part) for part in parts] == [3, 4]
     assert_same_arrays(tmp_path / "whole", tmp_path / "parts", 7)
     assert load_posterior(whole[4]).seed == KEY
+
+
+def test_a_single_recording_is_a_list_of_one(tmp_path: Path, cheap: list):
+    path = tmp_path / "pushes.npz"
+    save_history(path, recordings(1)[0])
+    for name, one in {"file": str(path), "path": path, "own": recordings(1)[0]}.items():
+        found = infer_sweep(jax.random.key(KEY), table_spec(), one, tmp_path / name)
+        assert [file.name for file in found] == ["object-000000.npz"]
+    assert cheap == [1, 1, 1]
 
 
 def test_what_is_there_is_not_done_again(tmp_path: Path, cheap: list):

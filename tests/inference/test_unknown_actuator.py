@@ -121,6 +121,7 @@ def test_a_gain_and_a_mass_are_told_apart_by_nothing_but_the_mass():
     assert known.contraction[known.names.index("box.actuator.gain")] > 0.99
 
 
+@pytest.mark.slow
 def test_sites_of_a_model_are_the_physical_numbers():
     spec = box_scene(ALL)
     model = make_model(spec, pushes(np.random.default_rng(2), 6))
@@ -187,6 +188,7 @@ def test_reports_and_files_tell_of_the_actuator(tmp_path):
     assert loaded.to_json() == posterior.to_json()
 
 
+@pytest.mark.slow
 def test_predictions_know_the_commands_from_before_their_start():
     """From the middle of a run, what was commanded earlier has yet to take effect."""
     quiet = 1e-6 * np.ones(6)
@@ -228,6 +230,7 @@ def test_what_cannot_keep_commands_refuses_a_delay():
         infer_kinds(jax.random.key(0), [box_scene(ALL)], [history])
 
 
+@pytest.mark.slow
 def test_delayed_rows_are_those_that_the_filter_steps_through():
     """A likelihood with a delay is that of a history whose actions were delayed."""
     spec = box_scene({"actuator": ["delay"]})

@@ -15,6 +15,7 @@ from boomdp_jax.interop import (
     register_brax_envs,
     task_randomisation,
 )
+from boomdp_jax.interop.brax_env import _check_task
 from boomdp_jax.physics import State
 
 with warnings.catch_warnings():
@@ -167,6 +168,20 @@ def test_randomised_worlds_move_by_their_own_numbers():
 def test_draws_without_an_axis_of_their_own_are_refused():
     with pytest.raises(ValueError, match="draws: expected hypotheses with one leading"):
         task_randomisation(Pendulum().default_params().physics)
+
+
+def test_draws_of_other_bodies_are_refused():
+    world = Pendulum().default_params()
+    two = jax.tree.map(lambda leaf: leaf[None], Acrobot().default_params().physics)
+    with pytest.raises(ValueError, match="draws: expected densities of 1 bodies, got "):
+        task_randomisation(two)(world, raw_keys(0))
+
+
+@pytest.mark.parametrize("task", [None, Pendulum])
+def test_what_is_no_task_is_refused(task):
+    # `BraxTask` begins with this; here types would be checked before.
+    with pytest.raises(ValueError, match=r"task: expected an environment, .* got "):
+        _check_task(task)
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ import pytest
 
 from boomdp_jax.envs import Pendulum
 from boomdp_jax.interop import BraxTask, train_ppo
+from tests.inference.posteriors import table_posterior
 
 with warnings.catch_warnings():
     # Of a library that brax uses.
@@ -68,6 +69,11 @@ def test_the_trainer_is_left_as_it_was_when_training_fails():
     with pytest.raises(RuntimeError, match="enough"):
         train_ppo(env, num_timesteps=1, draws=draws_of(env, [1.0]), wrap_env_fn=fail)
     assert train.jax is jax
+
+
+def test_a_posterior_of_other_bodies_is_refused():
+    with pytest.raises(ValueError, match="draws: expected bodies bob, got table"):
+        train_ppo(BraxTask(Pendulum()), draws=table_posterior(num_draws=8))
 
 
 def test_a_negative_number_of_steps_is_refused():

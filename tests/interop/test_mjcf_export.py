@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from boomdp_jax.interop import save_mjcf, to_mjcf
+from boomdp_jax.interop.mjcf_export import _check_types
 from boomdp_jax.physics.params import Actuator
 from tests.interop.mjcf_worlds import (
     ball,
@@ -143,6 +144,7 @@ def test_floor_brakes_within_the_stated_share():
         assert slid == pytest.approx(1.0 / (2 * 0.2 * 9.81), rel=0.065)
 
 
+@pytest.mark.slow
 def test_floor_turns_a_body_as_the_engine_does():
     spec = scene(
         [thing((1.0, -0.5, 1.5), center_of_mass=[0.1, 0.05])],
@@ -172,6 +174,7 @@ def test_sliding_wheel_feels_its_limit():
 FLOOR = {"half": (2.0, 0.1), "static": True}
 
 
+@pytest.mark.slow
 def test_box_slides_to_a_stop_on_a_static_one():
     touch = {"contact": {"friction": 0.3}}
     body = box("box", (-0.3, 0.1, 0), twist=[1.5, 0, 0], **touch)
@@ -262,6 +265,7 @@ def test_file_is_the_document(tmp_path):
     assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
 
 
+@pytest.mark.slow
 def test_law_shapes_of_wheel_and_floor_are_carried():
     spec = scene(
         [thing((1.0, -0.5, 1.5))],
@@ -293,6 +297,23 @@ def test_batch_is_refused():
     spec = WORLDS["free body"][0]
     batch = jax.tree.map(lambda leaf: leaf[None], spec.params())
     refused(spec, batch, "expected one hypothesis, got axes")
+
+
+@pytest.mark.parametrize(
+    ("order", "message"),
+    [
+        ("two.xml spec params", "spec: expected a SceneSpec, got str"),
+        ("params spec two.xml", "spec: expected a SceneSpec, got Params"),
+        ("spec two.xml params", "params: expected Params, got str"),
+        ("spec params spec", "path: expected a path, got SceneSpec"),
+    ],
+)
+def test_swapped_arguments_are_refused(order, message):
+    # The public functions begin with this; here their types would be checked before.
+    spec = WORLDS["free body"][0]
+    given = {"spec": spec, "params": spec.params()}
+    with pytest.raises(ValueError, match=message):
+        _check_types(*(given.get(name, name) for name in order.split()))
 
 
 def test_params_of_another_scene_are_refused():

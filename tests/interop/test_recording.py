@@ -145,6 +145,7 @@ def test_dry_joint_friction_holds_small_torques_and_brakes_by_its_limit():
     assert gain == pytest.approx(0.6 * limit / inertia * 0.8, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_engine_converges_to_a_recorded_cart_at_second_order():
     wheel = {"type": "wheel", "pose": [-0.12, -0.02, 0.05], "viscous": [4.0, 80.0]}
     truth = scene(wheel)

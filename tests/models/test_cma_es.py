@@ -35,6 +35,7 @@ def test_known_optima_are_found(fn, optimum, num_generations):
     np.testing.assert_allclose(found.best, optimum, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_ask_and_tell_are_the_loop():
     key = jax.random.key(2)
     state = cma_init(jnp.zeros(5), 0.5)

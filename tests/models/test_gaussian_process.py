@@ -97,6 +97,7 @@ def test_draws_have_the_predictive_mean_and_variance():
         assert abs(ratio - 1) < 4.5 * np.sqrt(2 / num)
 
 
+@pytest.mark.slow
 def test_tuning_raises_the_evidence_and_finds_what_does_not_matter():
     rng = np.random.default_rng(2)
     inputs = rng.normal(size=(40, 2))

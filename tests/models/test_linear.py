@@ -49,6 +49,7 @@ def example(num=30):
     return inputs, targets, rng.normal(size=(6, 4)) + 5.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ridge", [1e-6, 1e-2, 3.0])
 def test_ridge_regression_is_least_squares_with_penalty_rows(ridge):
     inputs, targets, query = example()
@@ -92,6 +93,7 @@ def test_tuning_chooses_little_for_a_law_and_much_for_noise():
     assert float(noise.ridge) >= 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", ["world", "body"])
 def test_nothing_known_means_coasting(frame, precision):
     model = BodyRegression(cart(walls=True).scene, LinearRegression(), frame=frame)
@@ -109,6 +111,7 @@ def test_nothing_known_means_coasting(frame, precision):
     assert np.all(np.isfinite(expected(model, learnt, two).array))
 
 
+@pytest.mark.slow
 def test_missing_readings_teach_nothing():
     model = BodyRegression(cart().scene, LinearRegression(capacity=20))
     before, wrench, after = part(ride(40), 0, 10)
@@ -118,6 +121,7 @@ def test_missing_readings_teach_nothing():
     assert np.all(np.isfinite(expected(model, learnt, part(ride(40), 0, 40)).array))
 
 
+@pytest.mark.slow
 def test_a_free_body_is_learnt_in_the_body_frame():
     model = BodyRegression(cart().scene, LinearRegression())
     rows = ride(260)

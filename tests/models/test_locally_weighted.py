@@ -43,6 +43,7 @@ def example(num=60):
     return inputs, targets, query
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", [15, 1000])
 @pytest.mark.parametrize("bandwidth", [0.4, 1.5])
 def test_predictions_are_those_of_a_slow_version(k, bandwidth):
@@ -55,6 +56,7 @@ def test_predictions_are_those_of_a_slow_version(k, bandwidth):
     np.testing.assert_allclose(told, truth, rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_tuning_takes_the_least_leave_one_out_error():
     inputs, targets, _ = example(40)
     regressor = LocallyWeighted(capacity=50, num_held_out=40)
@@ -81,6 +83,7 @@ def test_tuning_takes_the_least_leave_one_out_error():
     assert (float(fit.bandwidth), float(fit.ridge)) == pytest.approx(best)
 
 
+@pytest.mark.slow
 def test_groups_are_regressions_of_their_own_and_fall_back_on_zero():
     inputs, targets, query = example()
     group = np.arange(60) % 3
@@ -112,6 +115,7 @@ def test_kth_least_is_what_sorting_says(precision):
         assert float(kth_least(values, k)) == float(np.sort(values)[k - 1])
 
 
+@pytest.mark.slow
 def test_far_from_all_rows_predictions_are_finite_and_bounded(precision):
     model = BodyRegression(cart().scene, LocallyWeighted(capacity=60))
     rows = jax.tree.map(lambda leaf: leaf.astype(float), ride(80))
@@ -133,6 +137,7 @@ def test_a_few_rows_are_enough_to_be_finite(precision):
             np.testing.assert_allclose(told.twist, rows[0].twist, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_what_is_learnt_in_the_body_frame_turns_with_the_world():
     model = BodyRegression(cart().scene, LocallyWeighted(capacity=120))
     before, wrench, after = part(ride(240), 0, 120)

@@ -83,6 +83,7 @@ def test_a_bootstrap_draws_each_row_once_on_average():
     assert abs(drawn.var() - 1) < 4.5 * np.sqrt(3 / 20_000)
 
 
+@pytest.mark.slow
 def test_nothing_known_means_coasting_and_members_are_hypotheses():
     model = BodyRegression(cart().scene, NeuralEnsemble(**SMALL))
     rows = part(ride(120), 0, 12)

@@ -45,6 +45,7 @@ def model_of(scene, **settings):
     return ObjectOriented(scene, regressor, radius=0.2, **settings)
 
 
+@pytest.mark.slow
 def test_a_wall_is_learnt_by_the_side_that_touches_it():
     scene = cart(walls=True).scene
     rows = walled_rows(200)
@@ -116,6 +117,7 @@ def test_a_batch_of_predictions_is_a_loop_of_them():
         np.testing.assert_allclose(one.array, batch.array[t], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_walls_that_states_do_not_have_are_felt_all_the_same():
     scene, rows = cart(walls=True).scene, walled_rows(60)
     wall = rows[0].pose[0, 1:]
@@ -129,6 +131,7 @@ def test_walls_that_states_do_not_have_are_felt_all_the_same():
     np.testing.assert_allclose(also.pose, told.pose[:, :1], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_one_body_among_others_learns_what_all_at_once_do():
     scene, rows = cart(walls=True).scene, walled_rows(60)
     whole = model_of(scene)

@@ -93,6 +93,7 @@ def slow_sectors(scene, state, body, radius, num_sectors, num_rays):
     return touched
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_sectors", [4, pytest.param(3, marks=pytest.mark.slow)])
 def test_rays_meet_what_brute_force_says(num_sectors):
     spec = room()

@@ -51,6 +51,7 @@ def learnt_from(model, rows, pushed):
     return learnt
 
 
+@pytest.mark.slow
 def test_only_the_pushed_body_learns():
     rows = side_by_side(part(ride(40), 0, 12))
     model = regressions()
@@ -91,6 +92,7 @@ def test_bodies_that_touched_something_learn_nothing():
         np.testing.assert_array_equal(old, new)
 
 
+@pytest.mark.slow
 def test_known_bodies_move_as_each_does_alone():
     specs = [cart(), cart()]
     numbers = [specs[0].params(), specs[1].params()]

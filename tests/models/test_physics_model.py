@@ -75,6 +75,7 @@ def test_fewer_than_one_sample_is_refused(task):
         online.sample_params(jax.random.key(0), belief, 0)
 
 
+@pytest.mark.slow
 def test_the_most_probable_hypothesis_is_of_the_likeliest_structure(task):
     online = OnlineBelief(task.spec, capacity=16, num_particles=256)
     model = PhysicsModel(online, task.advance, is_point=True)

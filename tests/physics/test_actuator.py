@@ -48,6 +48,7 @@ def at_rest() -> State:
     return State(pose, jnp.zeros((2, 3)))
 
 
+@pytest.mark.slow
 def test_gain_and_bias_are_those_of_the_wrench():
     """Velocities by Newton, and a wall that no bias moves."""
     bias = [[1.0, -2.0, 0.1], [5.0, 5.0, 5.0]]
@@ -109,6 +110,7 @@ def test_commands_of_a_run_never_take_effect_before_it_begins():
     np.testing.assert_allclose(found[22, 1], 0.5)
 
 
+@pytest.mark.slow
 def test_velocities_are_those_of_commands_that_switch_within_a_step():
     """Steps of a hundredth, in which the command of the time is held."""
     rng = np.random.default_rng(2)
@@ -133,6 +135,7 @@ def test_velocities_are_those_of_commands_that_switch_within_a_step():
     assert np.abs(early.twist - there.twist).max() > 1e-2
 
 
+@pytest.mark.slow
 def test_derivatives_by_the_delay_are_those_of_differences():
     commands = np.random.default_rng(3).normal(size=(6, 2, 3))
 

@@ -91,6 +91,7 @@ def test_a_free_body_pushed_at_its_middle_moves_as_in_mujoco():
     np.testing.assert_allclose(ours.array[9::10, 0], theirs, atol=2e-4)
 
 
+@pytest.mark.slow
 def test_a_pendulum_swings_as_one_whose_centre_of_mass_is_given():
     """By an engine frame at the one point, and by one at the other."""
     pin = {"type": "revolute", "a": "box0", "b": "world", "viscous": 0.05}
@@ -154,6 +155,7 @@ def test_ground_and_ties_are_those_of_a_given_centre_of_mass(num_bodies):
     np.testing.assert_allclose(ours.array, state.array, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_push_at_the_reference_point_is_second_order_in_the_step():
     """A torque at the angle where a step begins would lag, and be of order one."""
     spec, push = scene(), jnp.array([[4.0, -3.0, 0.5]])
@@ -212,6 +214,7 @@ def test_a_state_comes_back_from_the_centre_of_mass():
     np.testing.assert_allclose(back.array, array, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_by_the_centre_of_mass_are_those_of_differences():
     spec = scene()
     start = State(jnp.zeros((1, 3)), jnp.array([[0.1, 0.2, 0.8]]))
@@ -228,6 +231,7 @@ def test_derivatives_by_the_centre_of_mass_are_those_of_differences():
         np.testing.assert_allclose(ours[:, axis], change / 2e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_contact_meets_the_outline_where_it_is():
     """A box falls on the floor and tips to its heavy side."""
     contact = {"friction": 0.8, "restitution": 0.0}

@@ -26,6 +26,7 @@ def test_box_on_a_floor_stands_still(precision):
     assert not np.any(info.overflow)
 
 
+@pytest.mark.slow
 def test_tower_of_five_boxes_stands_for_ten_seconds():
     boxes = [
         body(f"box{i}", (0.25, 0.25), (0.0, 0.25 + 0.5 * i, 0.0)) for i in range(5)
@@ -42,6 +43,7 @@ def test_tower_of_five_boxes_stands_for_ten_seconds():
     assert np.max(np.abs(states.pose[-1] - states.pose[-301])) < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("friction", "slides"), [(0.5, False), (0.2, True)])
 def test_box_on_a_slope_follows_coulombs_law(friction, slides):
     angle = np.deg2rad(20.0)
@@ -80,6 +82,7 @@ def test_two_balls_collide_by_newtons_law(restitution, precision):
     assert np.allclose(momentum, momentum[0], rtol=10 * tolerance, atol=tolerance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap", [0.0, 1e-5, 1e-3, 0.01])
 @pytest.mark.parametrize(
     ("order", "num_thrown", "heading"),
@@ -185,6 +188,7 @@ def test_mass_ratio_of_a_hundred_to_one_holds():
     assert np.max(info.overlap[-60:]) < 0.02
 
 
+@pytest.mark.slow
 def test_polygons_of_eight_corners_roll_and_rest():
     turns = 2 * np.pi * np.arange(8) / 8
     corners = 0.2 * np.stack([np.cos(turns), np.sin(turns)], axis=-1)
@@ -209,6 +213,7 @@ def test_far_apart_bodies_move_as_in_a_scene_without_contact(precision):
     assert np.allclose(states.pose[:, 1], expected, atol=tolerance)
 
 
+@pytest.mark.slow
 def test_batch_agrees_with_one_by_one_and_repeats_bit_for_bit():
     spec = spec_of(
         FLOOR,

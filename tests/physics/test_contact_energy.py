@@ -49,6 +49,7 @@ def test_no_impact_adds_energy_and_none_changes_momentum(impacts):
     np.testing.assert_allclose(*momentum, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_are_finite_and_those_of_differences(impacts):
     mass, ease, began, free, after = impacts
     most = np.maximum(energy(mass, began), energy(mass, free))

@@ -1,6 +1,7 @@
 """Rods: a point on a rod is a simple pendulum, and a rod does no work."""
 
 import numpy as np
+import pytest
 from scipy.integrate import solve_ivp
 
 from tests.physics.scenes import convergence_orders, run
@@ -48,6 +49,7 @@ def test_bob_on_a_rod_is_a_simple_pendulum_to_second_order():
     assert np.all(convergence_orders(errors) > 1.8), errors
 
 
+@pytest.mark.slow
 def test_rod_holds_under_load(precision):
     load = np.random.default_rng(2).normal(size=(1000, 1, 3)) * [20.0, 20.0, 1.0]
     world = bob((0.05, 0.08))
@@ -82,6 +84,7 @@ def test_off_centre_rod_converges_to_second_order():
     assert np.all(convergence_orders(errors) > 1.8), errors
 
 
+@pytest.mark.slow
 def test_rod_between_two_bodies_conserves_momentum(precision):
     rod = Rod(0, (0.1, 0.0), (-0.2, 0.0), 0.5, b=1)
     world = World([(0.3, 0.1), (0.2, 0.15)], [20.0, 30.0], rods=[rod])
@@ -105,6 +108,7 @@ def test_rod_of_no_length_is_finite_and_acts_as_a_pin():
     assert np.all(np.isfinite(trajectory.twist))
 
 
+@pytest.mark.slow
 def test_rod_and_pin_together_leave_no_freedom(precision):
     world = World(
         [(0.3, 0.1)],

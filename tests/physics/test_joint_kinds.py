@@ -98,6 +98,7 @@ def test_dry_friction_of_a_guide_holds_or_slows_down():
     assert slide(states)[-1] == pytest.approx(-KNEE_SPEED / 1.5, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_drawer_stops_at_the_end_of_its_range():
     states, info = run(drawer(lower=-0.5, upper=0.3), 60)
     assert np.min(slide(states)) > -0.5 - 1e-6
@@ -120,6 +121,7 @@ def test_a_motor_lifts_a_load_at_its_speed_or_not_at_all():
     assert lift(0.5 * weight) == pytest.approx(-0.5 * GRAVITY * 2.0, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_motor_turns_a_hinge_up_with_its_torque():
     hinge = tie("revolute", anchor_a=(-0.2, 0.0), motor_speed=3.0, motor_torque=0.05)
     spec = make_spec([box(pose=(0.2, 0.0, 0.0))], [hinge], gravity=(0.0, 0.0))

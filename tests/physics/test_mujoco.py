@@ -107,6 +107,7 @@ def test_pinned_box_moves_as_in_mujoco(viscous, gravity, wrench):
     assert_same_path(ours.pose[19::20], theirs, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_double_pendulum_moves_as_in_mujoco():
     world = World(
         [(0.2, 0.05), (0.25, 0.05)],

@@ -230,6 +230,7 @@ def test_double_pendulum_follows_lagrange_multipliers_to_second_order():
     assert np.all(convergence_orders(errors) > 1.7), errors
 
 
+@pytest.mark.slow
 def test_friction_between_two_bodies_acts_on_both():
     pin = Pin(0, (0.28, 0.0), (-0.18, 0.05), b=1, viscous=0.2)
     world = JOINED.with_(pins=[pin])

@@ -104,6 +104,11 @@ def test_the_unchanged_scene_is_fine():
         (("unknown", "wheel"), True, r"unknown.wheel: expected a whole .* got True"),
         (("prior",), [], r"prior: expected an object, got \[\]"),
         (("prior", "x"), [1, math.inf], r"prior.x\[1\]: expected a finite number"),
+        (
+            ("unknown", "actuator"),
+            ["gain", "gain"],
+            r"unknown.actuator: expected names that differ, got 'gain twice'",
+        ),
         ((*CART, "densty"), 1, r"body 'cart': .*'density'\?\), got 'densty'"),
         ((*CART, "name"), _DELETE, r"bodies\[0\]: expected a field 'name'"),
         ((*CART, "name"), "", r"body '': name: expected a printable name"),
@@ -202,6 +207,7 @@ def test_a_scene_that_is_no_object_is_refused(tmp_path: Path):
     ("content", "message"),
     [
         (b"", "expected JSON"),
+        (b'{"x":' + b"[" * 900 + b"]" * 900 + b"}", "nested too deep"),
         (json.dumps(_scene()).encode()[:-40], "expected JSON, .* cut short"),
         (b"\x80\x81", "expected JSON"),
         (b'{"dt": NaN}', "NaN is not a finite number"),
@@ -209,7 +215,7 @@ def test_a_scene_that_is_no_object_is_refused(tmp_path: Path):
         (b"[" * 100_000, "nested too deep"),
         (b" " * (MAX_SCENE_BYTES + 1), f"at most {MAX_SCENE_BYTES} bytes"),
     ],
-    ids=["empty", "truncated", "binary", "nan", "repeated", "deep", "large"],
+    ids=["empty", "nested", "truncated", "binary", "nan", "repeated", "deep", "large"],
 )
 def test_what_is_no_scene_file_is_refused(tmp_path: Path, content: bytes, message: str):
     path = tmp_path / "room.json"

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from boomdp_jax.physics import WORLD
+from boomdp_jax.physics.scene_file import load_scene, save_scene
 from boomdp_jax.physics.scene_spec import scene_spec_from_dict
 
 
@@ -328,6 +329,26 @@ def test_an_unknown_centre_of_mass_that_makes_no_sense_is_refused(
 ):
     with pytest.raises(ValueError, match=message):
         scene_spec_from_dict({**_scene(), **changes})
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.int64, np.array, jax.numpy.array])
+def test_arrays_and_their_numbers_stand_for_lists_and_numbers(kind, tmp_path):
+    content = {**_scene(), "gravity": np.zeros(2, int), "unknown": {}, "prior": {}}
+    expected = scene_spec_from_dict(copy.deepcopy(content)).to_dict()
+    table, wedge = content["bodies"][:2]
+    table["density"], table["static"] = kind(20), np.False_
+    table["pose"] = (kind(0), 0, np.zeros(()))
+    wedge["shape"]["vertices"] = np.array(wedge["shape"]["vertices"], np.float32)
+    wedge["feet"] = [np.array(foot) for foot in wedge["feet"]]
+    content["unknown"] = {"wheel": np.int64(0)}
+    spec = scene_spec_from_dict(content)
+    assert spec.to_dict() == expected
+    content["prior"] = {"density": {"center": kind(3)}}
+    save_scene(scene_spec_from_dict(content), tmp_path / "scene.json")
+    assert load_scene(tmp_path / "scene.json").prior == {"density": {"center": 3}}
+    table["pose"] = np.zeros(2)
+    with pytest.raises(ValueError, match=r"pose: expected a list of 3 .* got \[0.0, 0"):
+        scene_spec_from_dict(content)
 
 
 def test_numbers_of_the_actuator_may_be_unknown():

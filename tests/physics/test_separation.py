@@ -175,6 +175,7 @@ def test_a_pair_alone_is_its_entry_of_the_table():
         np.testing.assert_allclose(alone, table[a, b], atol=1e-15)
 
 
+@pytest.mark.slow
 def test_jit_equals_eager_and_vmap_equals_a_loop():
     states = state_at(poses_of(MIXED.num_bodies, 4))
     together = ALL_SEPARATIONS(MIXED.scene, states)
@@ -194,6 +195,7 @@ def total(pose, scene: Scene):
     return jnp.sum(jnp.where(jnp.isfinite(table), jnp.sin(table), 0.0))
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_finite_differences():
     poses = jnp.asarray(poses_of(MIXED.num_bodies, 32))
     tangents = jax.random.normal(jax.random.key(0), poses.shape)
@@ -207,6 +209,7 @@ def test_gradients_are_those_of_finite_differences():
     np.testing.assert_allclose(slopes, (ahead - behind) / (2 * step), atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reverse", [True, False], ids=["reverse", "forward"])
 def test_gradients_are_finite_where_distances_are_not_smooth(reverse, precision):
     shapes = spec_of(BOX, BOX, CIRCLE, CIRCLE).scene

@@ -89,6 +89,7 @@ def test_without_noise_it_is_rollout():
     assert np.all(info.is_finite)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "dt", [0.01, jnp.linspace(0.01, 0.03, 20)], ids=["one", "each"]
 )
@@ -99,6 +100,7 @@ def test_other_steps_than_the_scenes_are_those_of_rollout(dt):
     np.testing.assert_allclose(states.array, expected.array, rtol=1e-9, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_lone_body_without_noise_does_as_rollout_does(precision):
     scene, params = make_scene(LONE), make_params(LONE)
     start, push = make_state([[0.3, 0.0, 0.0]]), jnp.asarray(PUSH[:, :1], float)
@@ -109,6 +111,7 @@ def test_a_lone_body_without_noise_does_as_rollout_does(precision):
     np.testing.assert_allclose(states.array, expected.array, atol=tolerance)
 
 
+@pytest.mark.slow
 def test_contacts_without_noise_are_those_of_rollout_and_shaken_ones_hold():
     spec = scene_spec_from_dict(
         {
@@ -147,6 +150,7 @@ def test_contacts_without_noise_are_those_of_rollout_and_shaken_ones_hold():
     assert np.min(shaken.pose[:, 0, 1]) > 0.095, "it sank into the floor"
 
 
+@pytest.mark.slow
 def test_readings_err_by_what_was_asked_and_the_motion_does_not():
     spec = free_spec()
     noise = SimulationNoise(process=jnp.zeros(3), observation=jnp.asarray(OBSERVATION))
@@ -253,6 +257,7 @@ def test_many_runs_are_one_batch():
         np.testing.assert_allclose(many[2], one, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_gradients_by_scale_and_density_are_those_of_finite_differences():
     scene, params = make_scene(LONE), make_params(LONE)
 
@@ -280,6 +285,7 @@ def test_gradients_by_scale_and_density_are_those_of_finite_differences():
         assert abs(float(slope)) > 1e-4
 
 
+@pytest.mark.slow
 def test_readings_are_those_of_the_command_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     spec = free_spec()

@@ -24,6 +24,7 @@ def push(world: World):
     return run(world, START, TWIST, num_steps=50, wrench=PUSH).pose
 
 
+@pytest.mark.slow
 def test_turning_and_moving_the_world_turns_and_moves_the_motion():
     num_cases, num_steps = 64, 20
     generator = np.random.default_rng(3)
@@ -132,6 +133,7 @@ def on_axle(along: float, lateral: float) -> Wheel:
     return Wheel(0, (float(x), float(y)), 0.3, (0.0, lateral))
 
 
+@pytest.mark.slow
 def test_two_coaxial_wheels_act_as_one_with_the_sum(precision):
     tolerance = precision.choose(single=1e-5, double=1e-11)
     pair = with_wheels(on_axle(0.1, 3.0), on_axle(-0.15, 5.0))
@@ -149,6 +151,7 @@ def test_wheel_without_rolling_friction_may_slide_along_its_axle(precision):
     )
 
 
+@pytest.mark.slow
 def test_half_track_of_zero_is_a_single_contact():
     wheel = Wheel(0, (-0.2, 0.05), 0.3, (0.4, 8.0), (1.0, 2.0))
     world = with_wheels(wheel)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from boomdp_jax.physics import rollout, step
 from tests.physics.scenes import make_params, make_scene, make_state
@@ -27,6 +28,7 @@ def assert_close(one, other, atol=1e-12):
         np.testing.assert_allclose(first, second, atol=atol)
 
 
+@pytest.mark.slow
 def test_compiled_step_equals_the_eager_one(precision):
     scene, params, state = start()
     push = jnp.asarray(PUSH, float)
@@ -36,6 +38,7 @@ def test_compiled_step_equals_the_eager_one(precision):
     assert_close(jax.jit(step)(scene, params, state, push), eager, tolerance)
 
 
+@pytest.mark.slow
 def test_rollout_equals_a_loop_of_steps_with_the_cache_handed_on():
     scene, params, state = start()
     push = jnp.asarray(PUSH)
@@ -141,6 +144,7 @@ def test_float_type_of_the_input_is_kept(precision):
     assert info.constraint_error.dtype == expected
 
 
+@pytest.mark.slow
 def test_single_precision_stays_single_while_double_is_enabled():
     scene, params, state = start()
 

@@ -27,6 +27,7 @@ from tests.planning.mazes import (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_expanded_at_once", [1, 6])
 def test_paths_through_mazes_are_the_shortest(num_expanded_at_once):
     num_found = 0
@@ -54,6 +55,7 @@ def test_paths_through_mazes_are_the_shortest(num_expanded_at_once):
     assert 3 <= num_found < 10
 
 
+@pytest.mark.slow
 def test_leaf_values_save_expansions():
     cost = np.ones((SIZE, SIZE))
     found = plan(KEY, certain(cost), START, leaf_fn=steps_left)
@@ -110,6 +112,7 @@ def test_a_goal_that_may_not_be_the_best_is_told_apart():
     np.testing.assert_array_equal(found.sequence[0], 1)
 
 
+@pytest.mark.slow
 def test_a_small_budget_leads_to_the_nearest_known_state():
     cost = np.ones((SIZE, SIZE))
     cost[:-1, 3] = np.inf
@@ -143,6 +146,7 @@ def walk(key, wall, state, action):
     return target, jnp.linalg.norm(target - wall["goal"]) < 0.3
 
 
+@pytest.mark.slow
 def test_a_point_goes_round_a_wall_to_where_the_likelier_gap_is():
     goal = np.array([2.0, 0.0])
     walls = {"gap": jnp.array([2.0, -2.0]), "goal": jnp.asarray(np.stack([goal, goal]))}
@@ -181,6 +185,7 @@ def test_a_point_goes_round_a_wall_to_where_the_likelier_gap_is():
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("table_size", "max_probes", "overflows"), [(100, 3, True), (131, 131, False)]
 )
@@ -231,6 +236,7 @@ def test_held_actions_and_discount_enter_the_value():
     assert found.info.num_model_calls == 6 * found.tree.num_expansions
 
 
+@pytest.mark.slow
 def test_a_limit_of_depth_is_kept():
     cost = np.ones((SIZE, SIZE))
     limited = partial(in_maze, KEY, certain(cost), depth=2 * SIZE - 3)
@@ -242,6 +248,7 @@ def test_a_limit_of_depth_is_kept():
     assert near.tree.plan_length == 2 * SIZE - 3
 
 
+@pytest.mark.slow
 def test_a_path_longer_than_the_sequence_is_cut_off():
     cost = maze(4)
     whole = in_maze(KEY, certain(cost), START)
@@ -250,6 +257,7 @@ def test_a_path_longer_than_the_sequence_is_cut_off():
     np.testing.assert_array_equal(short.sequence, whole.sequence[:5])
 
 
+@pytest.mark.slow
 def test_forbidden_steps_are_not_taken():
     def reward(world, state, action, target):
         return jnp.where(world["is_forbidden"][target[0], target[1]], -jnp.inf, -1.0)
@@ -289,6 +297,7 @@ def test_far_too_large_cells_still_yield_an_action():
     assert found.index == 0
 
 
+@pytest.mark.slow
 def test_coordinates_may_leave_out_part_of_the_state():
     def step(key, cost, state, action):
         target, done = move(key, cost, state["place"], action)
@@ -312,6 +321,7 @@ def test_coordinates_may_leave_out_part_of_the_state():
     assert loose.tree.num_merged / loose.info.num_model_calls < merged
 
 
+@pytest.mark.slow
 def test_batch_and_jit_give_what_single_calls_give():
     cost = maze(4)
     free = np.argwhere(np.isfinite(cost))[::9]
@@ -323,6 +333,7 @@ def test_batch_and_jit_give_what_single_calls_give():
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-12), several, single)
 
 
+@pytest.mark.slow
 def test_single_precision_finds_the_same_path(precision):
     cost = maze(4)
     found = in_maze(KEY, certain(cost), START)
@@ -332,6 +343,7 @@ def test_single_precision_finds_the_same_path(precision):
     np.testing.assert_allclose(found.value, -distances(cost)[-1], rtol=tolerance)
 
 
+@pytest.mark.slow
 def test_arrays_and_numbers_of_the_world_do_not_compile_anew():
     in_maze(KEY, certain(maze(0)), START)
     TRACES.clear()

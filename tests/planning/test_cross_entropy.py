@@ -51,6 +51,7 @@ def test_what_leaves_the_box_is_moved_to_its_edge():
     assert plan.value == -20.0
 
 
+@pytest.mark.slow
 def test_least_spread_keeps_the_search_going():
     # One elite draw leaves no spread: without smoothing nothing new is drawn.
     options = {"elite_fraction": 0.005, "smoothing": 0.0, "num_iterations": 40}

@@ -95,6 +95,7 @@ def test_decision_and_value_are_the_whole_trees(is_shared):
     assert np.mean(num_expansions) < 0.7 * NUM_NODES
 
 
+@pytest.mark.slow
 def test_bounds_hold_whenever_the_budget_is_spent():
     world = table(3)
     for state in range(4):
@@ -112,6 +113,7 @@ def test_bounds_hold_whenever_the_budget_is_spent():
         assert np.all(short.tree.lower < short.tree.upper)
 
 
+@pytest.mark.slow
 def test_a_decision_takes_less_than_its_value():
     counts = []
     for seed in range(6):
@@ -132,6 +134,7 @@ HELD = {"leaf_fn": leaf, "action_repeat": 2}
 plan_held = partial(plan, leaf_bounds=(-1.0, 1.0), **HELD)
 
 
+@pytest.mark.slow
 def test_hypotheses_are_averaged_by_weight_with_leaf_values_and_held_actions():
     weight = np.array([0.6, 0.4])
     for state in range(4):
@@ -185,6 +188,7 @@ def test_bounds_of_one_sign_allow_for_the_end_of_an_episode(shift):
         np.testing.assert_allclose(found.value, expected.max(), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_bounds_by_functions_save_expansions():
     class Close:
         def lower(self, world, state, num_left):
@@ -252,6 +256,7 @@ def test_sequence_without_noise_earns_the_value():
         assert earned == found.value == world["value"][state, 5]
 
 
+@pytest.mark.slow
 def test_counts_are_those_of_a_tree_that_is_visited_whole():
     found = forward_search_sparse_sampling(
         KEY,
@@ -274,6 +279,7 @@ def test_counts_are_those_of_a_tree_that_is_visited_whole():
     assert found.info.num_model_calls == 40 * 3 * 5
 
 
+@pytest.mark.slow
 def test_batch_and_jit_give_what_single_calls_give():
     states = np.arange(NUM_STATES)
     single = [plan(KEY, certain(table(0)), state) for state in states]
@@ -285,6 +291,7 @@ def test_batch_and_jit_give_what_single_calls_give():
     )
 
 
+@pytest.mark.slow
 def test_single_precision_gives_the_same_decision(precision):
     world = table(2)
     found = plan(KEY, certain(world), 4)
@@ -295,6 +302,7 @@ def test_single_precision_gives_the_same_decision(precision):
     np.testing.assert_allclose(found.value, expected.max(), rtol=tolerance)
 
 
+@pytest.mark.slow
 def test_arrays_and_numbers_of_the_world_do_not_compile_anew():
     plan(KEY, certain(table(0)), 0)
     TRACES.clear()

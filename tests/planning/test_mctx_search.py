@@ -49,6 +49,7 @@ def mctx():
     return pytest.importorskip("mctx")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", POLICIES)
 def test_with_the_true_value_as_leaf_actions_are_good(mctx, policy):
     value = worlds.optimal_values(0.9)
@@ -94,6 +95,7 @@ def test_values_of_one_level_are_exact_and_averaged_by_weight(mctx, policy):
     assert plan.value == plan.q_values[plan.index]
 
 
+@pytest.mark.slow
 def test_action_that_was_not_tried_has_the_worst_value_of_its_tree_or_none(mctx):
     belief = (jnp.array([[1.0, 0.0], [2.0, 0.0]]), jnp.zeros(2))
     plan = plan_in_table(belief, 0, "muzero", num_simulations=1)
@@ -119,6 +121,7 @@ def pay_wager(hypothesis, state, action, next_state):
     return hypothesis[action]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", POLICIES)
 def test_action_that_is_good_under_all_hypotheses_beats_the_favourite_of_each(
     mctx, policy

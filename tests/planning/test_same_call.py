@@ -46,6 +46,7 @@ SIGNS = jnp.array([1.0, -1.0])
 START = jnp.asarray(0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("odds", "best"), [(4.0, RIGHT), (0.25, LEFT)])
 def test_weights_decide_between_opposed_hypotheses(name, odds, best):
     belief = (SIGNS, jnp.log(jnp.array([odds, 1.0])))
@@ -62,6 +63,7 @@ def test_hypothesis_without_weight_does_not_count_even_if_it_breaks(name):
     assert np.isfinite(plan.value)
 
 
+@pytest.mark.slow
 def test_jit_and_vmap_over_states_equal_a_loop(name):
     belief, key = (SIGNS, jnp.array([0.5, 0.0])), jax.random.key(1)
     states = jnp.array([-1.0, 0.3, 2.0])
@@ -86,6 +88,7 @@ COUNTED = {
 }
 
 
+@pytest.mark.slow
 def test_one_program_serves_all_numbers_and_its_calls_of_the_model_are_counted(name):
     num_traces, hypotheses = 0, []
 

@@ -82,6 +82,7 @@ def test_fresh_hypotheses_give_the_mean_of_outcomes():
     np.testing.assert_allclose(plan.q_values, [0.1, 0.0, -0.1], atol=4 * error)
 
 
+@pytest.mark.slow
 def test_hypotheses_are_kept_down_the_tree():
     # Whoever knows the sign gains at every level; drawn anew nothing can be gained.
     belief = (jnp.array([1.0, -1.0]), jnp.zeros(2))
@@ -129,6 +130,7 @@ def test_posteriors_are_beliefs():
     np.testing.assert_allclose(plan.q_values, [-2.0, 0.0, 2.0])
 
 
+@pytest.mark.slow
 def test_a_dropped_action_is_no_veto():
     # One place at level 2: whatever does not lead there is dropped, under each
     # hypothesis something else.
@@ -140,6 +142,7 @@ def test_a_dropped_action_is_no_veto():
     assert int(plan.info.num_dropped.sum()) > 0
 
 
+@pytest.mark.slow
 def test_the_rest_of_a_good_plan_is_not_forgotten():
     # The prize is at the end of a line of steps that a tree of one place loses.
     def step(key, hypothesis, state, action):
@@ -169,6 +172,7 @@ def test_the_rest_of_a_good_plan_is_not_forgotten():
     assert extra == 5
 
 
+@pytest.mark.slow
 def test_cell_size_from_steps_is_half_a_step():
     # Both coordinates move by known steps; the third never does.
     def step(key, hypothesis, state, action):
@@ -189,6 +193,7 @@ def test_cell_size_from_steps_is_half_a_step():
     np.testing.assert_array_equal(plan.info.num_nodes[0], [1, 2, 3])
 
 
+@pytest.mark.slow
 def test_pytrees_of_states_and_actions():
     def step(key, hypothesis, state, action):
         return {"x": state["x"] + action["push"], "n": state["n"] + 1}, False
@@ -257,6 +262,7 @@ def test_adaptive_root_pays_for_what_it_will_know():
     assert int(adaptive.index) == 0
 
 
+@pytest.mark.slow
 def test_adaptive_root_is_the_other_where_nothing_is_seen():
     belief = Belief(jnp.array([1.0, -1.0]), jnp.log(jnp.array([0.8, 0.2])))
     adaptive = sparse_sampling(

@@ -136,6 +136,7 @@ def test_merged_tree_is_the_full_one_where_nothing_merges():
         assert int(merged.info.num_model_calls) == int(full.info.num_model_calls)
 
 
+@pytest.mark.slow
 def test_counts_add_up_and_agree_with_unique_cells():
     plan = sparse_sampling(
         jax.random.key(0),
@@ -177,6 +178,7 @@ def test_counts_add_up_and_agree_with_unique_cells():
     assert merged.sum() > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -210,6 +212,7 @@ def test_calls_are_counted(options):
     assert len(count) == int(plan.info.num_model_calls)
 
 
+@pytest.mark.slow
 def test_mirrored_states_have_mirrored_values():
     def swing(key, hypothesis, state, action):
         angle, rate = state
@@ -237,6 +240,7 @@ def test_mirrored_states_have_mirrored_values():
     np.testing.assert_allclose(one.q_values, other.q_values[::-1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_regulator_is_near_its_optimum():
     # x' = x + u, cost x² + u² and P x² at the horizon: the Riccati equation gives the
     # value with a free u; with one of 81 it is a little less.
@@ -274,6 +278,7 @@ def p_gain(depth):
     return gain
 
 
+@pytest.mark.slow
 def test_the_end_pays_nothing_after_it():
     def step(key, hypothesis, state, action):
         return state + action, state + action >= 2
@@ -300,6 +305,7 @@ def test_the_end_pays_nothing_after_it():
     np.testing.assert_allclose(at_end.q_values, [-1.4, -1.0])
 
 
+@pytest.mark.slow
 def test_what_is_not_finite_is_avoided():
     def step(key, hypothesis, state, action):
         return jnp.where(action == 2, jnp.nan, state + action), False
@@ -319,6 +325,7 @@ def test_what_is_not_finite_is_avoided():
     assert np.all(np.isfinite(plan.q_values))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "overflow",
     [OVERFLOW_POLICIES[0]]

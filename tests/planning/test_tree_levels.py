@@ -26,6 +26,7 @@ def levels():
     return tree_levels(plan)
 
 
+@pytest.mark.slow
 def test_levels_are_the_places_that_a_walk_can_reach(levels):
     assert len(levels) == 6
     for number, level in enumerate(levels):

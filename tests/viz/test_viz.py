@@ -20,6 +20,7 @@ from boomdp_jax.viz import (
     draw_structure_bars,
     plot_posterior,
 )
+from boomdp_jax.viz.learning_curves import plot_curves
 from tests.inference.posteriors import (
     draws_like,
     make_posterior,
@@ -173,6 +174,13 @@ def test_every_body_that_moves_has_a_panel(tmp_path):
     titles = [axes.get_title().split(":")[0] for axes in figure.axes]
     assert titles == ["table", "chair", ""]
     assert path.read_text().startswith("<?xml")
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_axis_without_a_curve_is_no_reason_to_warn():
+    band = (np.full(3, 0.5),) * 3
+    figure = plot_curves({"true": band}, {"true": (np.zeros(3),) * 3}, title="short")
+    assert figure.axes[0].get_xlim()[0] == 1.0
 
 
 def test_importing_viz_does_not_import_matplotlib():

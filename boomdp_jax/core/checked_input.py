@@ -1,0 +1,125 @@
+"""Numbers that a caller gives, checked before a cast could change their meaning."""
+
+import operator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+
+def whole_number(name: str, value: Any, least: int) -> int:
+    """Read a count.
+
+    Args:
+        name: of the argument, for the message.
+        value: what was given.
+        least: the smallest that there may be.
+
+    Returns:
+        The count.
+
+    Raises:
+        ValueError: not a whole number (a truth value is none), or a smaller one.
+    """
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or isinstance(value, bool):
+        raise ValueError(
+            f"{name}: expected a whole number, at least {least}, got {value!r}"
+        )
+    if number < least:
+        raise ValueError(f"{name}: expected at least {least}, got {number}")
+    return number
+
+
+def is_real(dtype: Any) -> bool:
+    """Whether an array of a type holds real numbers; truth values are none."""
+    return jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.integer)
+
+
+def real_array(name: str, values: Any) -> np.ndarray:
+    """Read an array of real numbers, on the host.
+
+    Args:
+        name: of the argument, for the message.
+        values: what was given.
+
+    Returns:
+        The array in 64 bit, of whatever shape.
+
+    Raises:
+        ValueError: rows of unequal length, text, complex numbers or objects.
+    """
+    array = _any_array(name, values)
+    if not is_real(array.dtype):
+        raise ValueError(
+            f"{name}: expected real numbers, got an array of {array.dtype}"
+        )
+    return np.asarray(array, float)
+
+
+def episode_array(values: Any, num_rows: int) -> Int[np.ndarray, " time"]:
+    """Read which run each row belongs to.
+
+    Args:
+        values: a number for each row; whole ones of a float type will do.
+        num_rows: how many rows there are.
+
+    Returns:
+        The numbers in 32 bit; rows of one run follow each other.
+
+    Raises:
+        ValueError: another shape, numbers that are not whole or do not fit into 32 bit,
+            no numbers, or a run that is taken up again.
+    """
+    array = _any_array("episode", values)
+    wanted = "episode: expected whole numbers of 32 bit, got"
+    if not is_real(array.dtype):
+        raise ValueError(f"{wanted} an array of {array.dtype}")
+    if array.shape != (num_rows,):
+        raise ValueError(f"episode: expected shape ({num_rows},), got {array.shape}")
+    number = np.asarray(array, float)
+    # A NaN is neither whole nor small.
+    is_right = (number == np.round(number)) & (np.abs(number) < 2**31)
+    if not np.all(is_right):
+        raise ValueError(f"{wanted} {array[~is_right][0]}")
+    starts = np.flatnonzero(np.diff(number, prepend=np.nan) != 0)
+    if len(starts) > len(np.unique(number)):
+        raise ValueError(
+            "episode: expected the rows of an episode to follow each other, got one "
+            "that is taken up again"
+        )
+    return number.astype(np.int32)
+
+
+def check_fits(name: str, array: Float[np.ndarray, "time body channel"]) -> None:
+    """Make sure that no finite number becomes infinite on the default float type.
+
+    Args:
+        name: of the argument, for the message.
+        array: numbers in 64 bit, none of them infinite.
+
+    Raises:
+        ValueError: one does; which row, which body.
+    """
+    dtype = jax.dtypes.canonicalize_dtype(float)
+    is_large = np.abs(array) > jnp.finfo(dtype).max
+    if np.any(is_large):
+        row, body, _ = np.argwhere(is_large)[0]
+        raise ValueError(
+            f"{name}: expected numbers that fit {dtype}, got {array[row, body]} in row "
+            f"{row}, body {body}"
+        )
+
+
+def _any_array(name: str, values: Any) -> np.ndarray:
+    try:
+        return np.asarray(values)
+    except ValueError as error:
+        raise ValueError(
+            f"{name}: expected an array, got rows of unequal length"
+        ) from error

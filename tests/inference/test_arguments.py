@@ -1,0 +1,89 @@
+"""What inference says to arguments that are none."""
+
+import jax
+import numpy as np
+import pytest
+
+from boomdp_jax.core import make_history
+from boomdp_jax.inference import infer, infer_batch
+from boomdp_jax.inference.arguments import check_arguments, check_history
+from boomdp_jax.inference.infer import padded_histories
+from boomdp_jax.physics import scene_spec_from_dict
+
+KEY = jax.random.key(0)
+SPEC = scene_spec_from_dict(
+    {
+        "schema": "planar-scene-1",
+        "dt": 0.02,
+        "bodies": [{"name": "box", "shape": {"type": "circle", "radius": 0.2}}],
+        "unknown": {"revolute": 1},
+    }
+)
+
+
+def history_of(num_rows, num_bodies=1):
+    state = np.zeros((num_rows, num_bodies, 6))
+    return make_history(state, np.zeros((num_rows, num_bodies, 3)), state, 0.02)
+
+
+@pytest.mark.parametrize("history", [None, "pushes.npz", np.zeros((4, 1, 6))])
+def test_a_history_that_is_none_is_refused(history):
+    with pytest.raises(TypeError, match=r"history: expected a History, .*; got "):
+        check_history(SPEC, history)
+
+
+def test_a_history_of_other_bodies_or_of_a_batch_is_refused():
+    with pytest.raises(ValueError, match=r"history: expected 1 bodies, got 2"):
+        check_history(SPEC, history_of(3, 2))
+    batch = jax.tree.map(lambda leaf: leaf[None], history_of(3))
+    with pytest.raises(
+        ValueError, match=r"expected states \[time, body, 6\]; got .*1, 3"
+    ):
+        check_history(SPEC, batch)
+
+
+@pytest.mark.parametrize("spec", ["room.json", {"bodies": []}, SPEC.scene])
+def test_a_scene_that_is_none_is_refused(spec):
+    with pytest.raises(TypeError, match=r"spec: expected a SceneSpec, .*; got "):
+        check_arguments(KEY, [spec], [history_of(2)], None)
+
+
+def test_keys_lists_and_meshes_are_told_apart():
+    rows = history_of(2)
+    with pytest.raises(TypeError, match=r"key: expected one such as .*; got 0"):
+        check_arguments(0, [SPEC], [rows], None)
+    with pytest.raises(TypeError, match=r"mesh: expected a jax.sharding.Mesh; got 4"):
+        check_arguments(KEY, [SPEC], [rows], 4)
+    with pytest.raises(TypeError, match=r"specs: expected a list; got SceneSpec"):
+        check_arguments(KEY, SPEC, [rows], None)
+    with pytest.raises(
+        ValueError, match=r"histories: expected one per scene, 1, got 2"
+    ):
+        infer_batch(KEY, [SPEC], [rows, rows])
+
+
+@pytest.mark.parametrize(
+    ("count", "message"),
+    [
+        ({"num_samples": 0}, "num_samples: expected at least 1, got 0"),
+        ({"num_chains": 0}, "num_chains: expected at least 1, got 0"),
+        ({"num_chains": -2}, "num_chains: expected at least 1, got -2"),
+        ({"num_warmup": -1}, "num_warmup: expected at least 0, got -1"),
+    ],
+)
+@pytest.mark.parametrize("method", ["rj", "nuts"])
+def test_counts_that_are_too_small_are_refused_at_once(method, count, message):
+    with pytest.raises(ValueError, match=message):
+        infer(KEY, SPEC, history_of(2), method=method, **count)
+
+
+def test_an_empty_table_has_room_for_a_row():
+    (padded,) = padded_histories([history_of(0)])
+    assert (padded.capacity, int(padded.num_transitions)) == (1, 0)
+
+
+def test_an_empty_history_gives_the_prior():
+    posterior = infer(
+        KEY, SPEC, history_of(0), method="map", likelihood="one-step", num_samples=50
+    )
+    assert np.isfinite(posterior.log_evidence)
