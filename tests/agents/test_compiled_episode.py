@@ -57,6 +57,7 @@ def test_both_give_the_same_episode_of_a_learner():
     assert min(record.num_done for record in records) < task.num_steps
 
 
+@pytest.mark.slow
 def test_both_give_the_same_episode_of_chance():
     task = LineWorld(num_steps=10)
     params = task.default_params()

@@ -88,6 +88,7 @@ def test_the_cart_is_never_in_a_wall(rides):
     assert float(jnp.min(gap)) >= 0.0
 
 
+@pytest.mark.slow
 def test_it_was_stopped_or_moved_as_the_engine_says(rides):
     task, (before, wrench, after, _) = rides
     spec = cart_scene(is_known=True)

@@ -45,6 +45,7 @@ def test_results_have_a_row_for_each_seed(whole):
         np.testing.assert_array_equal(stored[field], values)
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_to_the_same_bits(whole, tmp_path):
     _, results = whole
     run = begin(tmp_path)

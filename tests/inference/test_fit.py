@@ -79,6 +79,7 @@ def test_one_step_gains_give_the_one_step_likelihood(wheeled):
     np.testing.assert_allclose(found.log_density, expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_gradient_is_that_of_the_log_density(wheeled):
     index, structure, z = random_points(wheeled, 6)
     fits = make_fits(wheeled, index, structure, 0.5 * z)

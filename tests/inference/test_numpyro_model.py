@@ -164,6 +164,7 @@ def with_noise(values, noise):
     return {**values, **scales}
 
 
+@pytest.mark.slow
 def test_integrated_over_the_noise_the_joint_density_is_the_targets(spec):
     """Groups are independent, so four integrals in one dimension do it."""
     model = make_model(spec, pushed(spec), {"table": ["revolute"]})
@@ -224,6 +225,7 @@ def test_scalar_noise_is_one_normal_likelihood_over_all_that_was_read(spec):
     assert float(found) == pytest.approx(expected, rel=1e-10)
 
 
+@pytest.mark.slow
 def test_missing_channels_do_not_count_and_angles_take_the_shorter_turn(spec):
     history = pushed(spec)
     read = np.array(history.next_state)

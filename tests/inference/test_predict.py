@@ -77,6 +77,7 @@ def test_errors_are_those_of_the_readings(report, horizon):
         assert scores[channel]["rmse"] == pytest.approx(np.sqrt(numbers) * sd, rel=0.35)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("horizon", HORIZONS)
 def test_intervals_cover_and_the_score_is_that_of_a_normal(report, horizon):
     scores = report["horizons"][str(horizon)]

@@ -217,6 +217,7 @@ def test_dry_friction_is_not_viscous():
     assert laws["viscous"].log_bayes_factor < 0.0
 
 
+@pytest.mark.slow
 def test_commands_that_come_late_are_a_delay():
     """By 8 ms of steps of 20 ms: part of each wrench is the one before."""
     table = worlds.box_table(np.random.default_rng(11), 100)

@@ -159,6 +159,7 @@ def test_a_weld_with_a_null_angle_is_inferred_and_the_rest_is_given():
     assert float(weld.angle[0]) == pytest.approx(POSE[2] + 0.05)
 
 
+@pytest.mark.slow
 def test_guesses_lie_where_the_readings_say():
     block = make_block(scene(unknown=UNKNOWN), (0,), recorded("drawer"))
     guess = Guesses.of(stack_blocks([block]))

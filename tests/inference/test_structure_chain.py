@@ -129,6 +129,7 @@ def scores_after(move, target, mixture, probability, means, covariances, num=600
     return scores, info
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MOVES)
 def test_each_move_alone_leaves_the_target_invariant(name):
     case = linear_case()
@@ -145,6 +146,7 @@ def test_each_move_alone_leaves_the_target_invariant(name):
         assert np.mean(accepted & changed) > 0.1
 
 
+@pytest.mark.slow
 def test_short_walks_about_the_posterior_are_nearly_always_accepted():
     target, design, data = make_problem()
     _, probability, means, covariances = closed_form(design, data)

@@ -127,6 +127,7 @@ def test_far_from_all_rows_predictions_are_finite_and_bounded(precision):
     assert np.max(np.abs(told.twist)) < 300.0
 
 
+@pytest.mark.slow
 def test_a_few_rows_are_enough_to_be_finite(precision):
     model = BodyRegression(cart().scene, LocallyWeighted(capacity=60))
     rows = jax.tree.map(lambda leaf: leaf.astype(float), part(ride(80), 0, 60))

@@ -68,6 +68,7 @@ def test_a_wall_is_learnt_by_the_side_that_touches_it():
     assert errors["without"] > 0.1
 
 
+@pytest.mark.slow
 def test_a_condition_never_seen_is_answered_by_the_one_without_contact():
     scene = cart(walls=True).scene
     rows = walled_rows(200)

@@ -114,6 +114,7 @@ def test_cradle_of_five_hands_the_speed_on(order, num_thrown, heading, gap):
     assert np.sum(along**2) == pytest.approx(np.sum(speed**2), rel=2e-3)
 
 
+@pytest.mark.slow
 def test_ball_bounces_to_the_height_that_restitution_allows():
     contact = {"friction": 0.0, "restitution": 0.8}
     ball = body("ball", 0.1, (0.0, 1.1, 0.0), **contact)

@@ -61,6 +61,7 @@ def test_rod_holds_under_load(precision):
     assert trajectory.is_finite.all()
 
 
+@pytest.mark.slow
 def test_off_centre_rod_follows_the_reference_and_keeps_energy(precision):
     world = bob((0.1, 0.1))
     pose = np.array([[0.5, -0.1, 0.0]])

@@ -195,6 +195,7 @@ def test_gradients_are_finite_where_joints_fit_exactly(precision):
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slopes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quantity", QUANTITIES, ids=lambda q: q.__name__)
 def test_jit_equals_eager_and_vmap_equals_a_loop(quantity):
     scene, params = make_scene(HEAVY), make_params(HEAVY)

@@ -152,6 +152,7 @@ def test_hypotheses_are_averaged_by_weight_with_leaf_values_and_held_actions():
         assert np.all(found.tree.num_contradictions == 0)
 
 
+@pytest.mark.slow
 def test_a_hypothesis_that_is_ruled_out_has_no_say():
     broken = table(1)
     broken["reward"] = np.full_like(broken["reward"], np.nan)

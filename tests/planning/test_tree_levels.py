@@ -35,6 +35,7 @@ def test_levels_are_the_places_that_a_walk_can_reach(levels):
         )
 
 
+@pytest.mark.slow
 def test_edges_join_neighbours_and_meet_where_nodes_merged(levels):
     for number, (level, below) in enumerate(itertools.pairwise(levels)):
         start, end = level.state[level.edge[:, 0]], below.state[level.edge[:, 1]]
