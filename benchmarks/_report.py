@@ -1,7 +1,6 @@
 """What a benchmark prints: JSON lines for machines, a table for people."""
 
 import argparse
-import importlib.metadata
 import json
 import math
 import os
@@ -9,6 +8,8 @@ import pathlib
 import sys
 
 import jax
+
+from boomdp_jax.core.versions import library_versions
 
 _VERSIONS = ("boomdp_jax", "jax", "jaxlib", "numpyro", "numpy", "mujoco")
 _COLUMNS = ("case", "metric", "value", "unit", "n", "peer_value", "target", "met")
@@ -47,7 +48,7 @@ class Reporter:
         """
         self._rows: list[dict] = []
         self._path = None if out is None else pathlib.Path(out)
-        self._versions = _installed_versions()
+        self._versions = library_versions(_VERSIONS)
         self._device = describe_device()
         if self._path is not None:
             self._path.parent.mkdir(parents=True, exist_ok=True)
@@ -120,16 +121,6 @@ def describe_device() -> str:
         f"{len(devices)} x {devices[0].device_kind} ({devices[0].platform}), "
         f"{os.cpu_count()} cores"
     )
-
-
-def _installed_versions() -> dict[str, str]:
-    versions = {}
-    for name in _VERSIONS:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            versions[name] = "not installed"
-    return versions
 
 
 def _plain(value: object) -> object:

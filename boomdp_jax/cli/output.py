@@ -1,6 +1,5 @@
 """What every command prints and where it may write."""
 
-import importlib.metadata
 import importlib.util
 import json
 import math
@@ -9,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from boomdp_jax.core.atomic import check_folder_takes_files
+from boomdp_jax.core.versions import library_versions
 
 _FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 
@@ -119,12 +119,6 @@ def versions() -> dict[str, str]:
     """Versions of what computes, for result files.
 
     Returns:
-        Version by distribution; those that are not installed are left out.
+        Version by distribution.
     """
-    found = {}
-    for name in ("boomdp_jax", "jax", "numpy"):
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return found
+    return library_versions(("boomdp_jax", "jax", "numpy"))

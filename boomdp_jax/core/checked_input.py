@@ -41,6 +41,20 @@ def is_real(dtype: Any) -> bool:
     return jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.integer)
 
 
+def check_real(name: str, dtype: Any) -> None:
+    """Raise a ValueError unless an array of a type holds real numbers."""
+    if not is_real(dtype):
+        raise ValueError(f"{name}: expected real numbers, got an array of {dtype}")
+
+
+def has_shape(shape: tuple[int, ...], wanted: tuple[int | str, ...]) -> bool:
+    """Whether a shape is the wanted one, in which a word is an axis of any length."""
+    return len(shape) == len(wanted) and all(
+        isinstance(want, str) or want == size
+        for want, size in zip(wanted, shape, strict=True)
+    )
+
+
 def real_array(name: str, values: Any) -> np.ndarray:
     """Read an array of real numbers, on the host.
 
@@ -55,10 +69,7 @@ def real_array(name: str, values: Any) -> np.ndarray:
         ValueError: rows of unequal length, text, complex numbers or objects.
     """
     array = _any_array(name, values)
-    if not is_real(array.dtype):
-        raise ValueError(
-            f"{name}: expected real numbers, got an array of {array.dtype}"
-        )
+    check_real(name, array.dtype)
     return np.asarray(array, float)
 
 

@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Int
 
-from boomdp_jax.core.checked_input import episode_array
+from boomdp_jax.core.checked_input import check_real, episode_array, has_shape
 from boomdp_jax.core.history import History, make_history
 
 _STATIC_TOLERANCE = 1e-3
@@ -153,15 +153,8 @@ def read_array(
         found = ", ".join(sorted(arrays)) or "none"
         raise ValueError(f"{source}: expected an array {name!r}, got {found[:200]}")
     array = arrays[name]
-    if array.dtype.kind not in "fiu":
-        raise ValueError(
-            f"{source}: {name}: expected real numbers, got an array of {array.dtype}"
-        )
-    is_match = len(array.shape) == len(shape) and all(
-        isinstance(want, str) or want == size
-        for want, size in zip(shape, array.shape, strict=True)
-    )
-    if not is_match:
+    check_real(f"{source}: {name}", array.dtype)
+    if not has_shape(array.shape, shape):
         wanted = ", ".join(map(str, shape))
         raise ValueError(
             f"{source}: {name}: expected shape [{wanted}], got {list(array.shape)}"

@@ -16,10 +16,10 @@ import numpy as np
 from boomdp_jax.agents.namo_episode import NamoRecord, Try
 from boomdp_jax.core.json_file import check_same, read_json, write_json
 from boomdp_jax.core.npz_file import read_npz, write_npz
+from boomdp_jax.core.versions import library_versions
 from boomdp_jax.envs.namo_room import KINDS
 from boomdp_jax.experiments.namo import CHARACTERS, make_room, namo_episode
 from boomdp_jax.experiments.run import SCHEMA
-from boomdp_jax.inference.posterior import library_versions
 
 FIELDS = ("is_solved", "seconds", "effort", "num_pushes", "num_wasted")
 """Numbers of one room in `results.npz`, beside `decision_seconds` (the median), and the

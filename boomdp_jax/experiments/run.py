@@ -24,9 +24,9 @@ from boomdp_jax.agents.episode import EpisodeRecord, run_episode
 from boomdp_jax.core.arrays import Key, on_device
 from boomdp_jax.core.json_file import check_same, read_json, write_json
 from boomdp_jax.core.npz_file import read_npz, write_npz
+from boomdp_jax.core.versions import library_versions
 from boomdp_jax.envs.environment import AbstractEnvironment, EnvParams
 from boomdp_jax.experiments.registry import agent_of, check_agent, make_task
-from boomdp_jax.inference.posterior import library_versions
 
 SCHEMA = "boomdp-run-1"
 """Version of the folder's format."""

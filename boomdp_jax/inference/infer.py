@@ -320,8 +320,7 @@ def seed_of(key: Key) -> int:
 def padded_histories(histories: Sequence[History]) -> list[History]:
     """Histories with few different capacities, none of over four times its own."""
     # An empty table has room for one row, from which shapes can be told.
-    longest = max((history.capacity for history in histories), default=1)
-    longest = max(longest, 1)
+    longest = max((history.capacity for history in histories), default=1) or 1
     out = []
     for history in histories:
         capacity = longest

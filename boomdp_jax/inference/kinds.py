@@ -11,6 +11,7 @@ import numpy as np
 from boomdp_jax.core.arrays import Key, on_device
 from boomdp_jax.core.compile_time import CompileClock
 from boomdp_jax.core.history import History
+from boomdp_jax.core.versions import library_versions
 from boomdp_jax.inference.assemble import assemble_posterior
 from boomdp_jax.inference.chain_diagnostics import diagnose_chains
 from boomdp_jax.inference.coordinates import Coordinates
@@ -36,7 +37,7 @@ from boomdp_jax.inference.kinds_posterior import KindsPosterior
 from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.noise_scales import draw_noise_scales
 from boomdp_jax.inference.one_step import NOISE_SHAPE
-from boomdp_jax.inference.posterior import Posterior, library_versions
+from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.sample import BlockDraws
 from boomdp_jax.inference.structure_chain import ChainDraws
 from boomdp_jax.inference.structure_draws import SampleSettings

@@ -15,11 +15,11 @@ from jaxtyping import Array, Float, Int
 from boomdp_jax.core.arrays import FloatScalar, Key
 from boomdp_jax.core.checked_input import whole_number
 from boomdp_jax.core.history import History
+from boomdp_jax.core.versions import library_versions
 from boomdp_jax.inference.body_numbers import inferred_numbers
 from boomdp_jax.inference.contact_numbers import report_collisions
 from boomdp_jax.inference.identity_record import as_record
 from boomdp_jax.inference.posterior_file import (
-    library_versions,
     read_posterior_file,
     write_posterior_file,
 )

@@ -1,7 +1,6 @@
 """The file of a posterior: arrays by name and a JSON header, read without trust."""
 
 import dataclasses
-import importlib.metadata
 import json
 import os
 from collections.abc import Mapping
@@ -96,18 +95,6 @@ _PAIRS = {
     "surface": (),
 }
 """Fields with two numbers in each slot."""
-
-
-def library_versions() -> dict[str, str]:
-    """Versions of what computes a posterior, as result files record them."""
-    names = ("boomdp_jax", "jax", "jaxlib", "numpyro", "equinox", "numpy")
-    versions = {}
-    for name in names:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            versions[name] = "not installed"
-    return versions
 
 
 def write_posterior_file(

@@ -25,10 +25,10 @@ from boomdp_jax.core.arrays import Key, on_device
 from boomdp_jax.core.history import History
 from boomdp_jax.core.history_file import load_history
 from boomdp_jax.core.json_file import check_same, read_json, write_json
+from boomdp_jax.core.versions import library_versions
 from boomdp_jax.inference.fixed_structure import Structure
 from boomdp_jax.inference.infer import METHODS, infer_batch, seed_of
 from boomdp_jax.inference.likelihoods import choose_likelihood
-from boomdp_jax.inference.posterior import library_versions
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 SCHEMA = "boomdp-sweep-1"

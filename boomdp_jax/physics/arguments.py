@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from boomdp_jax.core.checked_input import is_real
+from boomdp_jax.core.checked_input import check_real, has_shape
 from boomdp_jax.physics.state import State
 
 
@@ -126,15 +126,8 @@ def check_state_is_finite(state: State, names: Sequence[str]) -> None:
 def _rows(name: str, rows: Any, shape: tuple) -> Array:
     """Three numbers of each body; a word in `shape` is an axis of any length."""
     array = rows if isinstance(rows, jax.Array) else np.asarray(rows)
-    if not is_real(array.dtype):
-        raise ValueError(
-            f"{name}: expected real numbers, got an array of {array.dtype}"
-        )
-    is_right = len(array.shape) == len(shape) and all(
-        isinstance(wanted, str) or wanted == size
-        for wanted, size in zip(shape, array.shape, strict=True)
-    )
-    if not is_right:
+    check_real(name, array.dtype)
+    if not has_shape(array.shape, shape):
         wanted = ", ".join(map(str, shape))
         raise ValueError(
             f"{name}: expected shape ({wanted}), one row for each body of the scene, "
