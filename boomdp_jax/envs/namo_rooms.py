@@ -104,8 +104,12 @@ def random_room(seed: int, num_things: int, *, difficulty: float = 0.5) -> Room:
         ValueError: fewer or more things, a difficulty outside [0, 1], or a seed for
             which no such room was found among many.
     """
-    if not 2 <= num_things <= _MOST_THINGS:
-        raise ValueError(f"num_things: expected 2 to {_MOST_THINGS}, got {num_things}")
+    if num_things < 2:
+        raise ValueError(f"num_things: expected at least 2, got {num_things}")
+    if num_things > _MOST_THINGS:
+        raise ValueError(
+            f"num_things: expected at most {_MOST_THINGS}, got {num_things}"
+        )
     if not 0.0 <= difficulty <= 1.0:
         raise ValueError(f"difficulty: expected in [0, 1], got {difficulty}")
     rng = np.random.default_rng([num_things, seed])

@@ -107,10 +107,10 @@ def _sorted_horizons(horizons: Any) -> list[int]:
     """Each horizon once, the nearest first."""
     is_one = not isinstance(horizons, Iterable) or getattr(horizons, "shape", 0) == ()
     given = [horizons] if is_one else list(horizons)
-    whole = [whole_number("horizons", each, 1) for each in given]
-    if not whole:
-        raise ValueError("horizons: expected steps of at least 1, got none")
-    return sorted(set(whole))
+    whole = sorted({whole_number("horizons", each, 0) for each in given})
+    if not whole or whole[0] < 1:
+        raise ValueError(f"horizons: expected steps of at least 1, got {whole}")
+    return whole
 
 
 def sample_readings(

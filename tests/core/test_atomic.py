@@ -79,3 +79,8 @@ def test_a_pipe_is_written_to_and_stays_one(tmp_path: Path):
     assert taken == [b"all of it"]
     assert path.is_fifo()
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_missing_folder_is_an_os_error(tmp_path: Path):
+    with pytest.raises(FileNotFoundError):
+        atomic_write(tmp_path / "missing" / "result", b"new")
