@@ -312,14 +312,18 @@ def time_gradient(reporter, scene, params, batches, num_runs) -> None:
 
 def main() -> int:
     """Check the answer, then time it."""
-    arguments = parser_of(__doc__).parse_args()
+    parser = parser_of(__doc__)
+    parser.add_argument("--batches", nargs="+", type=int, default=BATCHES)
+    arguments = parser.parse_args()
     reporter = Reporter(arguments.out)
     scene, params = read_scene()
     is_right = check(reporter, scene, params, 8 if arguments.quick else 64)
     num_runs = 5 if arguments.quick else 11
-    batches = QUICK_BATCHES if arguments.quick else BATCHES
+    batches = QUICK_BATCHES if arguments.quick else arguments.batches
     time_forward(reporter, scene, params, batches, num_runs)
     gradient_batches = [64, 4096] if arguments.quick else [1, 64, 1000, 4096, 16384]
+    if arguments.batches != BATCHES:
+        gradient_batches = arguments.batches
     time_gradient(reporter, scene, params, gradient_batches, num_runs)
     reporter.print_table()
     return 0 if is_right else 1

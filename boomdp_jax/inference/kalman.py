@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import FloatScalar
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.inference.contact_prediction import ContactScene
 from boomdp_jax.inference.robust_update import correct_robustly
 from boomdp_jax.inference.track_data import TrackData, TrackRow, with_delay
@@ -132,6 +133,7 @@ class RowFilter:
         """To begin with, before any row; the first one starts a track."""
         return Estimate(jnp.zeros((self._num // 6, 6)), jnp.eye(self._num))
 
+    @full_precision
     def __call__(self, before: Estimate, row: TrackRow) -> tuple[Estimate, FilteredRow]:
         """Filter one row."""
         begin, num = row.is_start > 0, self._num
@@ -157,6 +159,7 @@ class RowFilter:
         gains = Gains(first_gain, last_gain, first_whitening, last_whitening)
         return estimate, FilteredRow(gains, first_density + last_density, start)
 
+    @full_precision
     def _update(self, estimate: Estimate, reading, mask):
         """One reading: new mean and covariance, gain, whitening, log-density."""
         state, covariance = estimate

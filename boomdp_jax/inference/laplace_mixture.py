@@ -20,6 +20,7 @@ from jax.scipy.special import gammaln, logsumexp
 from jaxtyping import Array, Bool, Float, Int
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar, Key
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.inference.noise import Noise, draw_noise, pick
 from boomdp_jax.inference.target import StructureTarget
 
@@ -70,6 +71,7 @@ class LaplaceMixture(eqx.Module):
         component = pick(self.log_weight, noise.choice[0])
         return self.sample_component(noise, target, component)
 
+    @full_precision
     def sample_component(
         self, noise: Noise, target: StructureTarget, component: IntScalar
     ) -> MixtureDraw:
@@ -217,6 +219,7 @@ def is_in_cell(
     return jnp.all(jnp.where(is_angle, jnp.abs(offset) < 0.5 * target.period, True))
 
 
+@full_precision
 def _block_factors(
     target: StructureTarget, whitening: Float[Array, "component dim dim"]
 ) -> tuple[Float[Array, "component dim dim"], Float[Array, "component dim dim"]]:
@@ -241,6 +244,7 @@ def _block_factors(
     return length[:, :, None] * factor, inverse / length[:, None, :]
 
 
+@full_precision
 def _apply(
     matrix: Float[Array, "component dim dim"], vector: Float[Array, "component dim"]
 ) -> Float[Array, "component dim"]:

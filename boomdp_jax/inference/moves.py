@@ -28,6 +28,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar, Key
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.inference.laplace_mixture import LaplaceMixture, is_in_cell
 from boomdp_jax.inference.noise import Noise, pick
 from boomdp_jax.inference.slot_conditional import sample_slot, slot_log_density
@@ -147,6 +148,7 @@ def neighbours(
     return is_near & (target.log_prior > -jnp.inf)
 
 
+@full_precision
 def propose_walk(
     noise: Noise,
     point: Point,
@@ -203,6 +205,7 @@ def decide(
     return moved, info._replace(is_made=proposal.is_made)
 
 
+@full_precision
 def leap(
     key: Key,
     point: Point,

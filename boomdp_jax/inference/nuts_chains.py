@@ -30,6 +30,7 @@ from numpyro.infer.hmc import hmc
 from numpyro.infer.util import potential_energy
 
 from boomdp_jax.core.arrays import Key
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.core.spread import Program, run_each
 from boomdp_jax.inference.block import stack_blocks
 from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics
@@ -98,17 +99,25 @@ def sample_model(
     states = chains.begin(keys[0], start)
     states, warm = chains.iterate(states, start.covariance, half)
     flat = _flatten(model, warm.z)[:, half // 2 :]
-    within = flat - jnp.mean(flat, axis=1, keepdims=True)
-    scatter = jnp.einsum("cdi,cdj->ij", within, within)
-    num = flat.shape[0] * flat.shape[1]
-    covariance = scatter + _LAPLACE_DRAWS * start.covariance
-    covariance = covariance / (num + _LAPLACE_DRAWS)
+    covariance = _pooled(flat, start.covariance)
     points = _stack([state.z for state in states])
     states = chains.begin(keys[1], Start(jax.device_put(points), covariance))
     states, _ = chains.iterate(states, covariance, half)
     report("sampling")
     _, drawn = chains.iterate(states, covariance, num_samples)
     return _collect(model, drawn)
+
+
+@full_precision
+def _pooled(
+    drawn: Float[Array, "chain draw number"], laplace: Float[Array, "number number"]
+) -> Float[Array, "number number"]:
+    """Covariance of all chains' draws together, each chain's about their mean."""
+    within = drawn - jnp.mean(drawn, axis=1, keepdims=True)
+    scatter = jnp.einsum("cdi,cdj->ij", within, within)
+    num = drawn.shape[0] * drawn.shape[1]
+    covariance = scatter + _LAPLACE_DRAWS * laplace
+    return covariance / (num + _LAPLACE_DRAWS)
 
 
 class _Drawn(NamedTuple):
@@ -205,11 +214,14 @@ def _stack(trees: list[Any]) -> Any:
 def _programs(static: _Static) -> tuple[Program, Program]:
     """What begins a chain, and what takes it some iterations further."""
 
+    # NumPyro's own products, those with the mass matrix, are made in here.
+    @full_precision
     def begin(shared: tuple, words: Array, point: dict[str, Array]) -> Any:
         arrays, covariance = shared
         start = Start(point, covariance)
         return _hmc(static.model(arrays), start, static.num_warmup, words)[0]
 
+    @full_precision
     def advance(shared: tuple, state: Any) -> tuple[Any, _Drawn]:
         arrays, covariance = shared
         # NumPyro's iteration is set up by making a start; the compiler drops it.
@@ -251,6 +263,7 @@ def fitted_start(
 
 
 @eqx.filter_jit
+@full_precision
 def _start_at(key: Key, model: ObjectModel, modes: Any, num_chains: int) -> Start:
     target = model.blocks[0].target
     tracked: Any = target.log_likelihood

@@ -17,6 +17,7 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, Int
 
 from boomdp_jax.core.arrays import FloatScalar, IntScalar, Key
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.inference.laplace_mixture import LaplaceMixture, make_mixture
 from boomdp_jax.inference.moves import Point, Proposal, accept, propose_walk
 from boomdp_jax.inference.noise import Noise, draw_noise, pick
@@ -100,6 +101,7 @@ def fit_mixture(block: BlockBelief) -> LaplaceMixture:
     )
 
 
+@full_precision
 def _moments(
     target: StructureTarget,
     particles: ParticleSet,

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.core.lanes import in_lanes
 
 DEGREES_OF_FREEDOM = 4.0
@@ -81,6 +82,7 @@ def correct_robustly(
     return RobustUpdate(*in_lanes(_correct, *arrays, static=(freedom,)))
 
 
+@full_precision
 def move(
     covariance: Float[Array, "channel channel"],
     rise: Float[Array, "start channel"],

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.inference.coordinates import Coordinates
 from boomdp_jax.inference.layout import BODY_NUMBERS, SlotKey
 from boomdp_jax.inference.one_step import Readings
@@ -22,6 +23,7 @@ def _rotation(angle: Float[Array, " time"]) -> Float[Array, "time 2 2"]:
     )
 
 
+@full_precision
 def pin_guess(
     data: Readings, body_a: int, body_b: int, reach: Float[Array, " body"]
 ) -> tuple[Float[Array, " 2"], Float[Array, " 2"]]:
@@ -67,6 +69,7 @@ def pin_guess(
     return solution[:2], solution[2:]
 
 
+@full_precision
 def axle_guess(data: Readings, body: int) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Heading across which a body moves least, and how far along it that holds.
 
@@ -145,6 +148,7 @@ def _pin_seed(coordinates: Coordinates, data: Readings, slot: SlotKey, reach):
     )
 
 
+@full_precision
 def _wheel_seed(coordinates: Coordinates, data: Readings, slot: SlotKey):
     around, body = coordinates.surroundings, slot.body_a
     heading, along = axle_guess(data, body)

@@ -19,6 +19,7 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.inference.laplace_mixture import (
     LaplaceMixture,
     coordinate_log_prior,
@@ -30,6 +31,7 @@ from boomdp_jax.inference.noise import Noise, pick
 from boomdp_jax.inference.target import StructureTarget
 
 
+@full_precision
 def sample_slot(
     noise: Noise,
     target: StructureTarget,
@@ -75,6 +77,7 @@ def sample_slot(
     return jnp.where(block, drawn, z), is_inside
 
 
+@full_precision
 def slot_log_density(
     target: StructureTarget,
     mixture: LaplaceMixture,
@@ -117,6 +120,7 @@ class _Split(NamedTuple):
     """Half the log-determinant of the block's precision."""
 
 
+@full_precision
 def _split(
     target: StructureTarget,
     mixture: LaplaceMixture,

@@ -29,6 +29,7 @@ from numpyro.infer.autoguide import AutoContinuous
 from numpyro.infer.util import constrain_fn, potential_energy
 
 from boomdp_jax.core.arrays import Key
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics
 from boomdp_jax.inference.fixed_structure import Structure
@@ -89,6 +90,7 @@ class WhitenedNormal(AutoContinuous):
         prefix = self.prefix
         return self._normal(params[f"{prefix}_loc"], params[f"{prefix}_scale_tril"])
 
+    @full_precision
     def _normal(self, loc: Array, tril: Array) -> dist.Distribution:
         return dist.MultivariateNormal(
             self.center + self.scale_tril @ loc, scale_tril=self.scale_tril @ tril
@@ -214,6 +216,7 @@ def _by_name(
 
 
 @eqx.filter_jit
+@full_precision
 def _fit(
     run_key: Key,
     draw_key: Key,

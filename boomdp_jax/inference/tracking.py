@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import FloatScalar, on_device
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.inference.contact_prediction import (
     ContactScene,
     contact_step,
@@ -302,6 +303,7 @@ def _dot(row, vector: list):
     return sum(terms[1:], terms[0])
 
 
+@full_precision
 def _apply(matrix, vector: Float[Array, "body 6"], *, is_lower: bool = False):
     """Matrix times channels, written out where there are few."""
     flat = vector.reshape(-1)

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.envs.action_set import ActionSet
 
 
@@ -39,6 +40,7 @@ class ContinuousActions(eqx.Module):
         numbers = self.basis.shape[1]
         return numbers + (self.num_ways if self.num_ways > 1 else 0)
 
+    @full_precision
     def wrench(self, action: Float[Array, " number"]) -> Float[Array, "body 3"]:
         """The wrench that an action stands for.
 

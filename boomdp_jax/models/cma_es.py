@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar, IntScalar, Key
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.models.table import check_at_least
 
 # Scales beyond which a search has run away, or stands still.
@@ -75,6 +76,7 @@ def cma_init(mean: Float[Array, " dim"], scale: FloatScalar | float) -> CmaState
     )
 
 
+@full_precision
 def cma_ask(
     key: Key, state: CmaState, population: int
 ) -> Float[Array, "population dim"]:
@@ -93,6 +95,7 @@ def cma_ask(
     return state.mean[None] + state.scale * white @ root.T
 
 
+@full_precision
 def cma_tell(
     state: CmaState,
     points: Float[Array, "population dim"],
@@ -213,6 +216,7 @@ def _constants(dim: int, population: int) -> _Constants:
     )
 
 
+@full_precision
 def _roots(
     covariance: Float[Array, "dim dim"],
 ) -> tuple[Float[Array, "dim dim"], Float[Array, "dim dim"]]:

@@ -14,12 +14,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar, IntScalar
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.models.table import check_at_least
 
 _DAMPING_FACTORS = (0.1, 1.0, 10.0)
 _FIRST_DAMPING, _DAMPING_LIMITS = 1e-2, (1e-8, 1e8)
 
 
+@full_precision
 def gauss_newton(
     residual_fn: Callable[[Float[Array, " dim"]], Float[Array, " residual"]],
     start: Float[Array, " dim"],

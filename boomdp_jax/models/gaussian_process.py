@@ -20,6 +20,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, Key
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.models.regression import AbstractRegressor
 from boomdp_jax.models.table import (
     Scaling,
@@ -205,6 +206,7 @@ class GaussianProcess(AbstractRegressor):
         )
         return jax.tree.map(lambda leaf: leaf[None], rows)
 
+    @full_precision
     def predict(
         self, key: Key, hypothesis: ProcessRows, inputs: Float[Array, " input"]
     ) -> Float[Array, " output"]:

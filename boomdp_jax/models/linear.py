@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, Key
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.models.regression import AbstractRegressor
 from boomdp_jax.models.table import (
     Scaling,
@@ -118,6 +119,7 @@ class LinearRegression(AbstractRegressor):
             lambda leaf: leaf[None], LinearMap(parts.scaling, slope, parts.level)
         )
 
+    @full_precision
     def predict(
         self, key: Key, hypothesis: LinearMap, inputs: Float[Array, " input"]
     ) -> Float[Array, " output"]:
@@ -126,6 +128,7 @@ class LinearRegression(AbstractRegressor):
         return hypothesis.level + hypothesis.scaling(inputs) @ hypothesis.slope
 
 
+@full_precision
 def leave_one_out_error(table: Table, ridge: FloatScalar) -> FloatScalar:
     """Mean squared error of what is predicted for each row without it.
 
@@ -162,6 +165,7 @@ class _Parts(NamedTuple):
     num: FloatScalar
 
 
+@full_precision
 def _decompose(table: Table) -> _Parts:
     """Centre, standardise, and find the axes."""
     weight = table.mask.astype(table.inputs.dtype)[:, None]
@@ -183,6 +187,7 @@ def _decompose(table: Table) -> _Parts:
     )
 
 
+@full_precision
 def _slope(parts: _Parts, ridge: FloatScalar) -> Float[Array, "input output"]:
     """Of the ridge regression."""
     along = parts.projected.T @ parts.centred

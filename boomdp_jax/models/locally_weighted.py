@@ -30,6 +30,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar, Key
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.models.regression import AbstractRegressor
 from boomdp_jax.models.table import (
     Scaling,
@@ -213,6 +214,7 @@ class LocallyWeighted(AbstractRegressor):
         level = _level(sums, point, hypothesis.ridge)
         return jnp.clip(level, hypothesis.low, hypothesis.high)
 
+    @full_precision
     def _sums(
         self,
         rows: LocalRows,
@@ -293,6 +295,7 @@ def _split(sums: Float[Array, " moment"], num_inputs: int) -> _Sums:
     )
 
 
+@full_precision
 def _level(
     sums: _Sums, point: Float[Array, " input"], ridge: FloatScalar
 ) -> Float[Array, " output"]:

@@ -270,6 +270,7 @@ def _network(key: Key, sizes: tuple[int, ...]) -> PyTree:
 
 def _forward(layers: PyTree, point: Float[Array, " input"]) -> Array:
     """Through all layers, with the swish of Ramachandran et al. (2017) in between."""
+    # At the default precision of the device: members differ by more than it rounds.
     *hidden, last = layers
     for layer in hidden:
         point = jax.nn.swish(point @ layer.weight + layer.offset)

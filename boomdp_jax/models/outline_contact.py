@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import FloatScalar, IntScalar
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
 
@@ -63,6 +64,7 @@ def condition_number(sectors: Bool[Array, " sector"]) -> IntScalar:
     )
 
 
+@full_precision
 def _met(
     scene: Scene,
     state: State,

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from boomdp_jax.core.arrays import BoolScalar, IntScalar
+from boomdp_jax.core.full_precision import full_precision
 
 # Of a column's mean: spreads below this share are rounding, not information.
 _LEAST_SPREAD = 1e-6
@@ -140,6 +141,7 @@ def spread_place(table: Table, inputs: Float[Array, " input"]) -> IntScalar:
     return jnp.where(table.num_seen < table.capacity, table.num_seen, place)
 
 
+@full_precision
 def squared_distances(
     points: Float[Array, "point column"], rows: Float[Array, "row column"]
 ) -> Float[Array, "point row"]:
@@ -148,6 +150,7 @@ def squared_distances(
     return jnp.maximum(square - 2.0 * points @ rows.T, 0.0)
 
 
+@full_precision
 def scaling_of(
     values: Float[Array, "row column"], mask: Bool[Array, " row"]
 ) -> Scaling:
@@ -169,6 +172,7 @@ def scaling_of(
     return Scaling(mean, jnp.where(varies, jnp.sqrt(jnp.where(varies, square, 1)), 1))
 
 
+@full_precision
 def size_of(values: Float[Array, "row column"], mask: Bool[Array, " row"]) -> Scaling:
     """Root mean square of the columns, about zero: units that keep zero zero."""
     weight = mask.astype(values.dtype)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.physics.center_of_mass import state_of_center
 from boomdp_jax.physics.joints import joints_of
 from boomdp_jax.physics.motion import Motion
@@ -54,6 +55,7 @@ def kinetic_energy(scene: Scene, params: Params, state: State) -> FloatScalar:
     return 0.5 * jnp.sum(mass * square + inertia * state.twist[:, 2] ** 2)
 
 
+@full_precision
 def potential_energy(scene: Scene, params: Params, state: State) -> FloatScalar:
     r"""Energy in the in-plane gravity, $-\sum_i m_i \, g \cdot x_i$.
 
@@ -87,6 +89,7 @@ def total_energy(scene: Scene, params: Params, state: State) -> FloatScalar:
     return kinetic + potential_energy(scene, params, state)
 
 
+@full_precision
 def linear_momentum(scene: Scene, params: Params, state: State) -> Float[Array, "2"]:
     r"""Momentum of all bodies together, $\sum_i m_i v_i$.
 

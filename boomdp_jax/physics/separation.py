@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar, IntScalar
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
 
@@ -83,6 +84,7 @@ def pair_separation(
     return core - scene.radius[body_a] - scene.radius[body_b]
 
 
+@full_precision
 def _core(scene: Scene, state: State, body: IntScalar | int):
     """Corners and outward normals, turned as the body is, and which edges are some.
 
@@ -100,6 +102,7 @@ def _core(scene: Scene, state: State, body: IntScalar | int):
     return corners @ turn, normals @ turn, is_edge
 
 
+@full_precision
 def _widest_gap(corners, normals, is_edge, others) -> FloatScalar:
     """Of all edges, the most by which every other corner is in front of it."""
     ahead = others @ normals.T - jnp.sum(corners * normals, axis=-1)[None, :]

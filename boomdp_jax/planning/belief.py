@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
 from boomdp_jax.core.arrays import IntScalar, Key
+from boomdp_jax.core.full_precision import full_precision
 
 
 class Belief(eqx.Module):
@@ -126,6 +127,7 @@ def most_probable(belief: Belief) -> Belief:
     return certain(belief[jnp.argmax(belief.log_weight)])
 
 
+@full_precision
 def mean_hypothesis(belief: Belief) -> Belief:
     """Weighted means of all numbers; what is not a float, of the most probable one."""
 

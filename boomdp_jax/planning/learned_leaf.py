@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from boomdp_jax.core.arrays import FloatScalar, Key
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.planning.grid import CoordinatesFn, all_numbers
 from boomdp_jax.planning.problem import check_positive
 from boomdp_jax.planning.rollouts import check_number
@@ -36,6 +37,7 @@ class LearnedLeaf(eqx.Module):
     bounds: Float[Array, "2"]
     """Least and largest value that it was learnt from; it says nothing beyond."""
 
+    @full_precision
     def __call__(self, hypothesis: PyTree, state: PyTree) -> FloatScalar:
         """Value of a state.
 
@@ -50,6 +52,7 @@ class LearnedLeaf(eqx.Module):
         value = self.mean + self._features(state) @ self.weight
         return jnp.clip(value, self.bounds[0], self.bounds[1])
 
+    @full_precision
     def _features(self, state: PyTree) -> Float[Array, " feature"]:
         x = jnp.asarray(self.coordinates_fn(state), self.scale.dtype)
         angle = self.frequency @ ((x - self.centre) / self.scale) + self.phase
@@ -102,6 +105,7 @@ def learned_leaf(
 
 
 @eqx.filter_jit
+@full_precision
 def _fit(
     key: Key,
     states: PyTree,

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from boomdp_jax.core.arrays import FloatScalar, Key
+from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.planning.action_box import action_box
 from boomdp_jax.planning.belief import Belief
 from boomdp_jax.planning.plan import Plan
@@ -154,8 +155,7 @@ def _search(
         z = jnp.clip(mean[None] + noise_scale.astype(dtype) * noise, -1.0, 1.0)
         returns = jax.vmap(lambda one: rollouts.returns(box.actions(one)))(z)
         weight = _weight(rollouts.mean(returns), temperature, relative).astype(dtype)
-        new = jnp.tensordot(weight, z, axes=1)
-        return jnp.where(jnp.sum(weight) > 0, new, mean), None
+        return jnp.where(jnp.sum(weight) > 0, _average(weight, z), mean), None
 
     mean, _ = jax.lax.scan(iterate, mean, jax.random.split(sample_key, num_iterations))
     sequence = box.actions(mean)
@@ -177,3 +177,11 @@ def _weight(
     gap = jnp.where(is_finite, value - best, -jnp.inf)
     weight = jnp.exp(gap / jnp.maximum(temperature, tiny))
     return weight / jnp.maximum(jnp.sum(weight), 1.0)
+
+
+@full_precision
+def _average(
+    weight: Float[Array, " sample"], sequences: Float[Array, "sample *shape"]
+) -> Float[Array, "*shape"]:
+    """Weighted mean of sequences."""
+    return jnp.tensordot(weight, sequences, axes=1)
