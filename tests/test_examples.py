@@ -8,6 +8,8 @@ import sys
 import numpy as np
 import pytest
 
+from tests.conftest import USERS_XLA_FLAGS
+
 EXAMPLES = pathlib.Path(__file__).parents[1] / "examples"
 LIMIT = 900
 """Seconds for a quick run. Compilation takes most of it: minutes on two busy cores,
@@ -21,7 +23,11 @@ def run_example(name, *arguments):
         capture_output=True,
         text=True,
         timeout=LIMIT,
-        env={**os.environ, "PYTHONPATH": str(EXAMPLES.parent)},
+        env={
+            **os.environ,
+            "PYTHONPATH": str(EXAMPLES.parent),
+            "XLA_FLAGS": USERS_XLA_FLAGS,
+        },
         check=False,
     )
 

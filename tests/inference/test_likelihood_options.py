@@ -192,11 +192,10 @@ def test_rows_without_a_start_are_left_out_and_counted(free):
 @pytest.mark.parametrize(
     "options",
     [
-        {"likelihood": "filtered"},
         {"likelihood": "one-step"},
         {"likelihood": "open-loop", "horizon": 10},
     ],
-    ids=["filtered", "one-step", "ten steps"],
+    ids=["one-step", "ten steps"],
 )
 def test_on_clean_dense_readings_all_find_the_truth(options):
     """Pin, wheel or floor friction, the density, and where the pin is."""

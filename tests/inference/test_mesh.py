@@ -21,7 +21,8 @@ PROGRAM = [sys.executable, "-m", "tests.inference.mesh_program"]
 
 def begin(num_devices: int, *arguments: object) -> subprocess.Popen:
     """Start the program with so many virtual devices, in single precision."""
-    flags = f"--xla_force_host_platform_device_count={num_devices}"
+    flags = os.environ.get("XLA_FLAGS", "")
+    flags += f" --xla_force_host_platform_device_count={num_devices}"
     environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     environment["JAX_CPU_COLLECTIVES_IMPLEMENTATION"] = "gloo"
     return subprocess.Popen(

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from boomdp_jax.planning import certain, sparse_sampling
-from boomdp_jax.planning.merging import OVERFLOW_POLICIES
 from boomdp_jax.planning.problem import make_problem
 from tests.planning.tabular import random_process
 from tests.reference.recursive_sparse_sampling import recursive_values
@@ -326,11 +325,7 @@ def test_what_is_not_finite_is_avoided():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "overflow",
-    [OVERFLOW_POLICIES[0]]
-    + [pytest.param(name, marks=pytest.mark.slow) for name in OVERFLOW_POLICIES[1:]],
-)
+@pytest.mark.parametrize("overflow", ["stratified", "gumbel"])
 def test_vmap_is_a_loop_and_jit_is_eager(overflow):
     options = {
         "depth": 5,
