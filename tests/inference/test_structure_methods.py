@@ -123,10 +123,10 @@ def test_good_modes_give_a_good_verdict(method):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", WITH_ERRORS)
 def test_stated_errors_are_honest(method):
-    """Scores of forty runs have a spread of one, within what chance allows."""
+    """Scores of twenty runs have a spread of one, within what chance allows."""
     _, truths = problem()
     scores = []
-    for key in range(40):
+    for key in range(20):
         evidence = drawn(method, key=100 + key).evidence
         for i, (log_evidence, _, _, _) in enumerate(truths):
             prior = np.asarray(problem()[0].log_prior[i])
