@@ -20,15 +20,13 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 # what then runs a tenth slower. Examples are run as users' programs are compiled, and
 # `tests/test_compilers.py` compares the two. Kept in the environment for workers, which
 # find the flags of the process that starts them.
-USERS_XLA_FLAGS = os.environ.setdefault(
-    "USERS_XLA_FLAGS", os.environ.get("XLA_FLAGS", "")
-)
+_users = os.environ.setdefault("USERS_XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
 _QUICK_COMPILER = (
     "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
 )
 if importlib.metadata.version("jaxlib").startswith(("0.9.", "0.10.")):
     # What is given by hand comes last, and wins.
-    os.environ["XLA_FLAGS"] = f"{_QUICK_COMPILER} {USERS_XLA_FLAGS}".strip()
+    os.environ["XLA_FLAGS"] = f"{_QUICK_COMPILER} {_users}".strip()
 # XLA takes its own tuning flags for features that the machine lacks, and says so at
 # length of each program that it loads.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
