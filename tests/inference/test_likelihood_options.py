@@ -292,6 +292,7 @@ SMALL, LARGE = SCALE, np.array([5e-3, 5e-3, 5e-3, 0.08, 0.08, 0.08])
         (LARGE, 0.0, "one-step", False),
         (LARGE, 0.0, "open-loop", False),
         (SMALL, 0.05, "filtered", True),
+        (SMALL, 0.05, "one-step", True),
         (SMALL, 0.05, "open-loop", False),
     ],
 )

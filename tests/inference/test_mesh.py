@@ -67,8 +67,8 @@ def test_one_two_and_eight_devices_give_the_same_bits(tmp_path: Path, method: st
 
 
 @pytest.mark.slow
-def test_two_processes_give_the_bits_of_one(tmp_path: Path):
-    method = "rj"
+@pytest.mark.parametrize("method", ["rj", "nuts"])
+def test_two_processes_give_the_bits_of_one(tmp_path: Path, method: str):
     with socket.socket() as probe:
         probe.bind(("localhost", 0))
         port = probe.getsockname()[1]

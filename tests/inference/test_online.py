@@ -134,7 +134,7 @@ def test_the_same_key_gives_the_same_bits_step_by_step_and_scanned(online):
     assert sizes[0] == pytest.approx(sizes[1], rel=0.5)
 
 
-@pytest.mark.parametrize("name", ["free", "pinned"])
+@pytest.mark.parametrize("name", ["free", "cart", "pinned"])
 def test_a_belief_agrees_with_inference_on_all_rows_at_once(online, name):
     rows = simulate(11, [name] * 60)
     belief, _ = followed(online, online.init(jax.random.key(4)), rows)
