@@ -13,6 +13,7 @@ __version__ = "0.1.0"
 # Name -> module; loaded at first use, so that importing the package stays light.
 _LAZY = {
     "History": "boomdp_jax.core",
+    "keep_programs": "boomdp_jax.core",
     "load_history": "boomdp_jax.core",
     "save_history": "boomdp_jax.core",
     "Params": "boomdp_jax.physics",
@@ -43,6 +44,7 @@ __all__ = [
     "infer",
     "infer_batch",
     "infer_sweep",
+    "keep_programs",
     "load_history",
     "load_posterior",
     "load_scene",

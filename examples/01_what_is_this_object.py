@@ -35,6 +35,7 @@ parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("--out", type=pathlib.Path, default="out/what_is_this_object")
 arguments = parser.parse_args()
 arguments.out.mkdir(parents=True, exist_ok=True)
+boomdp_jax.keep_programs()  # The next run does not compile again.
 
 FAMILIES = (
     ("table", "cart") if arguments.quick else ("box", "table", "cart", "pendulum")

@@ -46,6 +46,7 @@ for file in FILES:
     if not file.is_file():
         parser.error(f"{file}: no such recording; it comes from {SOURCE}")
 arguments.out.mkdir(parents=True, exist_ok=True)
+boomdp_jax.keep_programs()  # The next run does not compile again.
 
 
 # %% From angle, rate and torque at 200 Hz to a moving bob at 50 Hz

@@ -26,6 +26,7 @@ from jax.scipy.special import logsumexp
 from jax.scipy.stats import t as student
 from matplotlib.figure import Figure
 
+from boomdp_jax import keep_programs
 from boomdp_jax.physics import State, empty_cache, scene_spec_from_dict, step
 
 SOURCE = "https://github.com/robinzhoucmu/Pushing"
@@ -48,6 +49,7 @@ for file in FILES:
     if not file.is_file():
         parser.error(f"{file}: no such recording; it comes from {SOURCE}")
 arguments.out.mkdir(parents=True, exist_ok=True)
+keep_programs()  # The next run does not compile again.
 NUM_LEARNT = 3 if arguments.quick else 10
 NUM_BOARD, NUM_FINGER = (10, 6) if arguments.quick else (32, 24)
 

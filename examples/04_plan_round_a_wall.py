@@ -35,6 +35,7 @@ parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("--out", type=pathlib.Path, default="out/plan_round_a_wall")
 arguments = parser.parse_args()
 arguments.out.mkdir(parents=True, exist_ok=True)
+boomdp_jax.keep_programs()  # The next run does not compile again.
 
 GOAL, START = np.array([5.28, 1.38]), [1.75, 1.34, 0.4]
 HALF_LENGTH, HALF_WIDTH = 0.50, 0.28

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
+from boomdp_jax import keep_programs
 from boomdp_jax.envs import room_params, room_scene, story_room
 from boomdp_jax.experiments import namo_episode
 from boomdp_jax.physics import State
@@ -32,6 +33,7 @@ parser.add_argument("--quick", action="store_true", help="a film of fewer frames
 parser.add_argument("--out", type=pathlib.Path, default="out/namo")
 arguments = parser.parse_args()
 arguments.out.mkdir(parents=True, exist_ok=True)
+keep_programs()  # The next run does not compile again.
 
 # %% What the robot does, and what it expected
 room = story_room(arguments.seed)

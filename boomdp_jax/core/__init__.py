@@ -12,6 +12,7 @@ from boomdp_jax.core.history_file import load_history as load_history
 from boomdp_jax.core.history_file import load_transitions as load_transitions
 from boomdp_jax.core.history_file import save_history as save_history
 from boomdp_jax.core.history_file import save_transitions as save_transitions
+from boomdp_jax.core.kept_programs import keep_programs as keep_programs
 from boomdp_jax.core.transition_table import TransitionTable as TransitionTable
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "TransitionTable",
     "atomic_file",
     "atomic_write",
+    "keep_programs",
     "load_actions",
     "load_history",
     "load_transitions",
