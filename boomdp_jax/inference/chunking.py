@@ -150,6 +150,8 @@ def for_each_chunk(
         do not count, anything.
     """
 
+    # Compiled with the rest, but its Python runs once for both uses below.
+    @jax.jit
     def one(number):
         ours = jax.tree.map(lambda leaf: leaf[owner[number]], known)
         return function(ours, jax.tree.map(lambda leaf: leaf[number], points))
@@ -159,9 +161,10 @@ def for_each_chunk(
     # One after the other: with a batch axis of their own, what the points of a chunk
     # share would have to be spread over all of them before every small loop. That takes
     # twice as long, and the extended filter four times.
+    first = jnp.zeros_like(num)
     start = jax.tree.map(
         lambda leaf: jnp.zeros((len(owner), *leaf.shape), leaf.dtype),
-        jax.eval_shape(one, jnp.zeros((), owner.dtype)),
+        jax.eval_shape(one, first),
     )
 
     def add(number, found):
@@ -173,4 +176,4 @@ def for_each_chunk(
             one(number),
         )
 
-    return jax.lax.fori_loop(0, num, add, start)
+    return jax.lax.fori_loop(first, num, add, start)

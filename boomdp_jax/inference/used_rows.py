@@ -38,6 +38,8 @@ def scan_used(
     if is_used is None:
         return jax.lax.scan(advance, carry, rows)
     num = is_used.shape[0]
+    # Compiled with the rest, but its Python runs once for both uses below.
+    advance = jax.jit(advance)
     size = max(n for n in range(1, _MOST_AT_A_TIME + 1) if num % n == 0)
 
     def split(leaf: Array) -> Array:
