@@ -129,7 +129,8 @@ def report_contact(
         )
         names = [spec.names[i] for i in np.flatnonzero(is_open)]
         found = summarise(value, weights, prior, _SCALES[name])
-        report[name] = {"bodies": names, **found}
+        found["bodies"] = names
+        report[name] = found
     return report
 
 
@@ -171,7 +172,8 @@ def report_mass_ratios(
             for draws in (params, prior_params)
         )
         found = summarise(ratio, weights, prior, "log")
-        report.append({"bodies": [spec.names[i], spec.names[j]], **found})
+        found["bodies"] = [spec.names[i], spec.names[j]]
+        report.append(found)
     return report
 
 

@@ -11,7 +11,7 @@ from boomdp_jax.inference.structure_report import (
     report_slots,
     structure_name,
 )
-from boomdp_jax.inference.summary import CHANNELS, IMPULSES, summarise
+from boomdp_jax.inference.summary import CHANNELS, IMPULSES, Summary, summarise
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene_spec import SceneSpec
 
@@ -236,7 +236,7 @@ def format_report(report: dict, structures: dict[str, float], num_draws: int) ->
     for name, body in report["bodies"].items():
         lines.append(
             f"{name:<16}{_interval(body['mass']):<32}{_interval(body['density']):<32}"
-            f"{'yes' if body['identified'] else 'no: the prior'}"
+            f"{'yes' if body['identified'] else 'no: ' + _whose(body['mass'])}"
         )
     for name, body in report["bodies"].items():
         for key, (title, units) in _BODY_TITLES.items():
@@ -269,7 +269,7 @@ def format_report(report: dict, structures: dict[str, float], num_draws: int) ->
     lines += ["", "noise of one reading (sd)"]
     for name, noise in report["noise"].items():
         parts = [
-            f"{channel.replace('_', ' ')} {plus_minus(noise[channel])} {unit}"
+            f"{channel.replace('_', ' ')} {_quantity(noise[channel], [unit])}"
             for channel, unit in _NOISE_UNITS.items()
             if channel in noise
         ]
@@ -350,7 +350,7 @@ def _units(kind: str, key: str) -> list[str]:
     return ["m", "m"] if key.startswith("anchor") else ["m"]
 
 
-def _quantity(summary: dict, units: list[str]) -> str:
+def _quantity(summary: Summary, units: list[str]) -> str:
     """Every number as mean ± sd and unit, marked where it is only the prior's."""
     columns = {
         key: value if isinstance(value, list) else [value]
@@ -363,9 +363,17 @@ def _quantity(summary: dict, units: list[str]) -> str:
         if number["mean"] is None:
             parts.append("unlimited")
             continue
-        mark = "" if number["identified"] else " (prior)"
+        whose = _whose(summary, place).removeprefix("the ")
+        mark = "" if number["identified"] else f" ({whose})"
         parts.append(f"{plus_minus(number)} {unit}".rstrip() + mark)
     return ", ".join(parts)
+
+
+def _whose(summary: Summary, place: int = 0) -> str:
+    """What a number is that is not identified."""
+    if summary.is_prior[place]:
+        return "the prior"
+    return "one hypothesis" if not np.ravel(summary["sd"])[place] else "uncertain"
 
 
 def plus_minus(number: dict) -> str:

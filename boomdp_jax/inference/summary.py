@@ -2,7 +2,9 @@
 
 A quantity is *identified* where its posterior variance is under half of its prior
 variance on the scale that it is sampled on; where it is not, the prior's interval is
-what can honestly be said, so that is what is reported.
+what can honestly be said, so that is what is reported. Unless the data moved the
+quantity without narrowing it, as a few noisy readings do with a prior that is narrow
+and beside the truth: then the draws' own interval is reported.
 """
 
 import math
@@ -16,6 +18,13 @@ Scale = Literal["identity", "log", "logit", "axial"]
 CHANNELS = ("position", "angle", "velocity", "spin")
 IMPULSES = ("velocity_impulse", "spin_impulse")
 """Groups of readings that share a noise scale, in the order of the last axis."""
+
+_LEAST_MOVED = 0.5
+"""Prior sds between the means of draws and prior above which they are not the same."""
+
+_NO_DIRECTION = 0.5
+"""Variance [rad²] of axial angles above which their mean says nothing: uniform ones
+have 0.82."""
 
 _FEWEST_DRAWS = 5.0
 """Effective draws below which a variance is not worth comparing with the prior's."""
@@ -56,12 +65,21 @@ def axial_difference(angle: np.ndarray, centre: float) -> np.ndarray:
     return np.mod(angle - centre + 0.5 * np.pi, np.pi) - 0.5 * np.pi
 
 
+class Summary(dict):
+    """Fields of a summary as JSON has them, and what people are told besides."""
+
+    def __init__(self, fields: dict, is_prior: tuple[bool, ...]):
+        super().__init__(fields)
+        self.is_prior = is_prior
+        """Of each number, whether its interval is the prior's."""
+
+
 def summarise(
     draws: np.ndarray,
     weights: np.ndarray,
     prior: np.ndarray | None,
     scale: Scale | tuple[Scale, ...] = "identity",
-) -> dict:
+) -> Summary:
     """Summarise one quantity, number by number.
 
     Args:
@@ -82,37 +100,47 @@ def summarise(
     columns = []
     for number, one_scale in enumerate(scales):
         value = table[:, number]
-        if prior is None:
-            columns.append(
-                {**_statistics(value, weights, one_scale), "identified": False}
-            )
-            continue
-        reference = np.asarray(prior, np.float64).reshape(len(prior), -1)[:, number]
-        equal = np.full(len(reference), 1.0 / len(reference))
-        if np.all(reference == reference[0]):
-            columns.append(
-                {**_statistics(value, weights, one_scale), "identified": True}
-            )
-        elif len(value) == 1:
-            # A single hypothesis says what it is, and nothing of what is known.
-            columns.append(
-                {**_statistics(value, weights, one_scale), "identified": False}
-            )
-        elif _is_identified(value, weights, reference, equal, one_scale):
-            columns.append(
-                {**_statistics(value, weights, one_scale), "identified": True}
-            )
-        else:
-            columns.append(
-                {**_statistics(reference, equal, one_scale), "identified": False}
-            )
-    if not is_vector:
-        return plain(columns[0])
-    return plain({key: [column[key] for column in columns] for key in columns[0]})
+        reference = prior
+        if prior is not None:
+            reference = np.asarray(prior, np.float64).reshape(len(prior), -1)[:, number]
+        columns.append(_summarise_one(value, weights, reference, one_scale))
+    fields = columns[0][0]
+    if is_vector:
+        fields = {key: [column[key] for column, _ in columns] for key in fields}
+    return Summary(plain(fields), tuple(is_prior for _, is_prior in columns))
+
+
+def _summarise_one(
+    value: np.ndarray, weights: np.ndarray, prior: np.ndarray | None, scale: Scale
+) -> tuple[dict, bool]:
+    """Statistics of one number's draws or of its prior, and whether of the latter."""
+    own = _statistics(value, weights, scale)
+    if prior is None:
+        return {**own, "identified": False}, False
+    equal = np.full(len(prior), 1.0 / len(prior))
+    if np.all(prior == prior[0]):
+        return {**own, "identified": True}, False
+    if len(value) == 1:
+        # A single hypothesis says what it is, and nothing of what is known.
+        return {**own, "identified": False}, False
+    num = 1.0 / np.sum(weights**2)
+    centre, spread = _moments(value, weights, scale, prior)
+    prior_centre, prior_spread = _moments(prior, equal, scale, prior)
+    if num >= _FEWEST_DRAWS and spread < 0.5 * prior_spread:
+        return {**own, "identified": True}, False
+    # The draws' mean has an error of its own.
+    least = _LEAST_MOVED * np.sqrt(prior_spread) + 2.0 * np.sqrt(spread / num)
+    if scale == "axial" and prior_spread > _NO_DIRECTION:
+        least = np.inf
+    if num >= _FEWEST_DRAWS and abs(centre - prior_centre) > least:
+        return {**own, "identified": False}, False
+    return {**_statistics(prior, equal, scale), "identified": False}, True
 
 
 def plain(value: Any) -> Any:
     """Turn arrays and numbers into what JSON knows; what is not finite becomes None."""
+    if isinstance(value, Summary):
+        return value
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -148,28 +176,24 @@ def _statistics(value: np.ndarray, weights: np.ndarray, scale: Scale) -> dict:
     }
 
 
-def _is_identified(
-    value: np.ndarray,
-    weights: np.ndarray,
-    prior: np.ndarray,
-    prior_weights: np.ndarray,
-    scale: Scale,
-) -> bool:
-    """Whether the posterior variance is under half of the prior's."""
-    if 1.0 / np.sum(weights**2) < _FEWEST_DRAWS:
-        return False
-    spread = _variance(value, weights, scale)
-    return bool(spread < 0.5 * _variance(prior, prior_weights, scale))
+def _moments(
+    value: np.ndarray, weights: np.ndarray, scale: Scale, prior: np.ndarray
+) -> tuple[float, float]:
+    """Mean and variance on a scale; NaN where a value is infinite.
 
-
-def _variance(value: np.ndarray, weights: np.ndarray, scale: Scale) -> float:
-    """Variance on a scale; NaN where a value is infinite."""
+    Axial angles are unrolled at their own mean, which is told from the prior's.
+    """
+    centre = 0.0
     if scale == "axial":
-        value = axial_difference(value, axial_mean(value, weights))
+        own = axial_mean(value, weights)
+        middle = axial_mean(prior, np.full(len(prior), 1.0 / len(prior)))
+        centre = float(axial_difference(np.array([own]), middle)[0])
+        value = axial_difference(value, own)
     elif scale == "log":
         value = np.log(np.maximum(value, np.finfo(np.float32).tiny))
     elif scale == "logit":
         size = np.finfo(np.float32).tiny
         value = np.log(np.maximum(value, size)) - np.log(np.maximum(1.0 - value, size))
     with np.errstate(invalid="ignore"):
-        return float(weights @ (value - weights @ value) ** 2)
+        mean = float(weights @ value)
+        return centre + mean, float(weights @ (value - mean) ** 2)

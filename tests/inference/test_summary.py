@@ -61,6 +61,44 @@ def test_a_scale_parameter_is_judged_by_its_logarithm():
     assert summarise(0.01 * prior, equal(1000), prior)["identified"] is True
 
 
+@pytest.mark.parametrize("scale", ["identity", "log", "logit", "axial"])
+def test_what_moved_without_getting_narrower_is_told_as_it_is(scale):
+    generator = np.random.default_rng(9)
+    near, far = 0.2 * generator.normal(size=(2, 1000)) + np.array([[0.0], [0.6]])
+    to_scale = {
+        "identity": lambda x: x,
+        "log": np.exp,
+        "logit": lambda x: 1.0 / (1.0 + np.exp(-x)),
+        # An axis across the cut at a right angle.
+        "axial": lambda x: x + 0.5 * np.pi - 0.3,
+    }[scale]
+    prior, draws = to_scale(near), to_scale(far)
+    ours = summarise(draws, equal(1000), prior, scale)
+    assert ours["identified"] is False
+    assert ours.is_prior == (False,)
+    difference = ours["q50"] - np.median(draws)
+    if scale == "axial":
+        difference = math.remainder(difference, math.pi)
+    assert abs(difference) < 1e-9
+    unmoved = summarise(to_scale(near + 0.02), equal(1000), prior, scale)
+    assert unmoved.is_prior == (True,)
+    assert unmoved["mean"] == pytest.approx(prior.mean())
+
+
+def test_few_draws_may_lie_apart_by_chance():
+    prior = np.random.default_rng(10).normal(size=1000)
+    ours = summarise(np.array([0.1, 2.0, 1.5, -0.5, 0.9, 2.2]), equal(6), prior)
+    assert ours.is_prior == (True,)
+
+
+def test_numbers_of_a_vector_that_moved_are_told_from_others():
+    prior = np.random.default_rng(11).normal(size=(400, 2))
+    ours = summarise(prior + np.array([2.0, 0.0]), equal(400), prior)
+    assert ours["identified"] == [False, False]
+    assert ours.is_prior == (False, True)
+    assert ours["mean"] == pytest.approx(prior.mean(0) + np.array([2.0, 0.0]))
+
+
 def test_headings_beside_the_cut_average_across_it():
     spread = 0.1 * np.random.default_rng(4).normal(size=500)
     angle = 0.5 * np.pi + spread
