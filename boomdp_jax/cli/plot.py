@@ -14,6 +14,7 @@ from boomdp_jax.experiments.scores import (
     LoadedRun,
     Score,
     check_comparable,
+    check_is_run,
     load_run,
     mean_band,
     scores,
@@ -30,6 +31,9 @@ def run(arguments: argparse.Namespace) -> None:
         ValueError: a folder that is no run, holds no episode, or is of another task.
     """
     folders = [Path(folder) for folder in arguments.runs]
+    # Before the figure, which by default goes into the first of them.
+    for folder in folders:
+        check_is_run(folder)
     path = Path(arguments.out or folders[0] / "curves.png")
     check_figure(str(path))
     report(folders, path, as_json=arguments.json)

@@ -14,13 +14,24 @@ from boomdp_jax.core.applied_force import wrench_at_reference
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.core.history_file import save_transitions
 from boomdp_jax.physics.params import Params
+from boomdp_jax.physics.same_bodies import check_same_bodies
 from boomdp_jax.physics.scene import Scene
+from boomdp_jax.physics.scene_arrays import build_surface
 from boomdp_jax.physics.scene_file import load_scene
 from boomdp_jax.physics.scene_spec import SceneSpec
+from boomdp_jax.physics.start_gaps import start_gaps
 from boomdp_jax.physics.state import State, state_from_array
 
 _NUM_CHANNELS = np.array([2, 1, 2, 1])
 """Channels of a state that share a noise scale: position, angle, velocity, spin."""
+
+_DEFAULTS = {
+    "actuator.gain": "1",
+    "actuator.bias": "0",
+    "actuator.delay": "0 s",
+    "center_of_mass": "where the pose is",
+}
+"""What is simulated of a number that a scene leaves to be inferred."""
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -41,9 +52,16 @@ def run(arguments: argparse.Namespace) -> None:
         actions = load_actions(arguments.actions, spec)
         params = spec.with_surface(_load_params(arguments, spec))
         if actions.initial_state is None:
-            initial_state = spec.initial_state()
+            start, initial_state = f"{spec.source}: pose", spec.initial_state()
         else:
+            start = f"{actions.source}: initial_state"
             initial_state = state_from_array(jnp.asarray(actions.initial_state))
+        print_notes(
+            [
+                f"{start}: {gap}; the first step takes it there"
+                for gap in start_gaps(params, initial_state, spec.names)
+            ]
+        )
         before, after = simulate(spec.scene, params, initial_state, actions)
         _check_finite(after, spec, actions)
         if arguments.noise is not None:
@@ -158,21 +176,41 @@ def _load_params(arguments: argparse.Namespace, spec: SceneSpec) -> Params:
     if arguments.posterior is None:
         if any(spec.unknown.values()):
             print_notes([f"{spec.source}: unknown constraints are taken to be absent"])
+        print_notes(_defaults(spec))
         return spec.params()
     from boomdp_jax.inference.posterior import load_posterior
 
     posterior = load_posterior(arguments.posterior)
-    if posterior.spec.names != spec.names:
-        raise ValueError(
-            f"{arguments.posterior}: expected bodies {', '.join(spec.names)[:200]}, as "
-            f"in {spec.source}, got {', '.join(posterior.spec.names)[:200]}"
-        )
+    as_in = f", as in {spec.source}"
+    check_same_bodies(posterior.spec, spec, arguments.posterior, as_in)
     draw, num_draws = arguments.draw or 0, posterior.params.density.shape[0]
     if draw >= num_draws:
         raise ValueError(
             f"{arguments.posterior}: --draw: expected less than {num_draws}, got {draw}"
         )
     return jax.tree.map(lambda leaf: leaf[draw], posterior.params)
+
+
+def _defaults(spec: SceneSpec) -> list[str]:
+    """What stands in for numbers of bodies that are to be inferred."""
+    taken = [
+        f"{spec.source}: unknown.{name} is taken to be {default}"
+        for name, default in _DEFAULTS.items()
+        if name in spec.unknown_numbers
+    ]
+    surface = build_surface(spec.bodies)
+    if surface is None:
+        return taken
+    for field in ("friction", "restitution"):
+        numbers = np.asarray(getattr(surface, field))
+        for body, number in zip(spec.bodies, numbers, strict=True):
+            given = getattr(body, field)
+            if given is not None and np.isnan(given):
+                taken.append(
+                    f"{spec.source}: body {body.name!r}: unknown contact.{field} is "
+                    f"taken to be {number:g}"
+                )
+    return taken
 
 
 def _check_finite(

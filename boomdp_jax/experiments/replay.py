@@ -13,6 +13,7 @@ from boomdp_jax.envs.namo_room import TIME_STEP, room_params, room_scene
 from boomdp_jax.experiments.namo import make_room
 from boomdp_jax.experiments.registry import make_task
 from boomdp_jax.experiments.run import SCHEMA
+from boomdp_jax.experiments.scores import check_is_run
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene_spec import SceneSpec
 from boomdp_jax.physics.state import State
@@ -50,6 +51,7 @@ def replay(folder: str | os.PathLike, seed: int | None = None) -> Replay:
         OSError: it cannot be read.
     """
     folder = Path(folder)
+    check_is_run(folder)
     content = read_json(folder / "run.json", SCHEMA)
     there = [
         number

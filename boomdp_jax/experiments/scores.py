@@ -102,6 +102,26 @@ class Score(NamedTuple):
     learning: float
 
 
+def check_is_run(folder: str | os.PathLike) -> None:
+    """Refuse a folder that is no run before one of its files is missed.
+
+    Args:
+        folder: what `run --out` wrote.
+
+    Raises:
+        ValueError: a folder of something else, or none.
+    """
+    folder = Path(folder)
+    if (folder / "run.json").is_file():
+        return
+    got = "one without run.json"
+    if not folder.is_dir():
+        got = "a file" if folder.exists() else "none there"
+    raise ValueError(
+        f"{folder}: is not a run: expected a folder written by `run`, got {got}"
+    )
+
+
 def load_run(folder: str | os.PathLike) -> LoadedRun:
     """Read the episodes of a run, as many as there are.
 
@@ -113,6 +133,7 @@ def load_run(folder: str | os.PathLike) -> LoadedRun:
         OSError: it cannot be read.
     """
     folder = Path(folder)
+    check_is_run(folder)
     content = read_json(folder / "run.json", SCHEMA)
     seeds = [folder / f"seed-{seed:05d}.npz" for seed in range(content["num_seeds"])]
     records = [read_npz(path) for path in seeds if path.exists()]

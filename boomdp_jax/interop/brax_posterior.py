@@ -14,6 +14,7 @@ from jaxtyping import Array, PyTree
 from boomdp_jax.envs import AbstractEnvironment, EnvParams
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.physics.params import Params
+from boomdp_jax.physics.same_bodies import check_same_bodies
 
 
 def task_randomisation(
@@ -29,7 +30,8 @@ def task_randomisation(
             of it, whose draws are taken by weight.
         num_draws: how many of a posterior there are to choose from, at most; default:
             all.
-        task: what is trained; a posterior must then be of bodies with its names.
+        task: what is trained; a posterior must then be of bodies with its names and
+            outlines.
 
     Returns:
         A function of a world and of one random key for each environment. It returns
@@ -42,11 +44,8 @@ def task_randomisation(
             of other bodies than the task's.
     """
     if isinstance(draws, Posterior):
-        if task is not None and draws.spec.names != task.spec.names:
-            raise ValueError(
-                f"draws: expected bodies {', '.join(task.spec.names)[:200]}, got "
-                f"{', '.join(draws.spec.names)[:200]}"
-            )
+        if task is not None:
+            check_same_bodies(draws.spec, task.spec, "draws")
         draws = draws.thin(draws.num_draws if num_draws is None else num_draws).params
     if draws.density.ndim != 2:
         raise ValueError(

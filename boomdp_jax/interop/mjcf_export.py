@@ -11,7 +11,7 @@ import dataclasses
 import math
 import os
 import xml.etree.ElementTree as ET
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import numpy as np
@@ -35,6 +35,7 @@ from boomdp_jax.interop.mjcf_tree import (
 )
 from boomdp_jax.physics.params import WORLD, Params
 from boomdp_jax.physics.scene_arrays import has_contact
+from boomdp_jax.physics.scene_fields import in_terms_of_json, read_number, refuse
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 Integrator = Literal["implicitfast", "implicit", "Euler", "RK4"]
@@ -75,15 +76,16 @@ def to_mjcf(
         The document. Push a body by `xfrc_applied`, at its centre of mass.
 
     Raises:
-        ValueError: params that are not one hypothesis for this scene, or what MuJoCo
-            cannot express: a drawer, or a pin with friction, range or motor, that
-            closes a loop; numbers of actuators; a body with two floors.
+        ValueError: params that are not one hypothesis for this scene, a time step or
+            integrator that MuJoCo lacks, or what it cannot express: a drawer, or a pin
+            with friction, range or motor, that closes a loop; numbers of actuators; a
+            body with two floors.
     """
     host = _on_host(spec, params)
     if time_step is None:
         time_step = spec.dt / max(1, math.ceil(spec.dt / _MOST_TIME_STEP - 1e-9))
-    writer = _Writer(spec, host, time_step)
-    return writer.write(integrator)
+    time_step = _read_options(time_step, integrator)
+    return _Writer(spec, host, time_step).write(integrator)
 
 
 def save_mjcf(
@@ -121,6 +123,13 @@ def _check_types(spec: object, params: object, path: object = "") -> None:
     ):
         if not isinstance(value, kind):
             raise ValueError(f"{name}: expected {expected}, got {type(value).__name__}")
+
+
+def _read_options(time_step: object, integrator: object) -> float:
+    """The time step, checked, as is the integrator: MuJoCo would fail later."""
+    if integrator not in get_args(Integrator):
+        refuse("integrator", f"one of {', '.join(get_args(Integrator))}", integrator)
+    return read_number(in_terms_of_json(time_step), "time_step", is_positive=True)
 
 
 def _on_host(spec: SceneSpec, params: Params) -> Params:

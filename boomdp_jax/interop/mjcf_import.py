@@ -8,7 +8,7 @@ import numpy as np
 from boomdp_jax.interop.mjcf_bodies import read_bodies, touching_pairs
 from boomdp_jax.interop.mjcf_document import Document
 from boomdp_jax.interop.mjcf_elements import restitution_of
-from boomdp_jax.interop.mjcf_joints import read_joints
+from boomdp_jax.interop.mjcf_joints import check_joint_kinds, read_joints
 from boomdp_jax.interop.mjcf_ties import read_equalities, read_floor
 from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
 
@@ -45,6 +45,7 @@ def from_mjcf(
         ImportError: MuJoCo is not installed.
     """
     document = Document(source)
+    check_joint_kinds(document)
     gravity = _read_world(document)
     bodies, owners = read_bodies(document, inertia_tolerance)
     normal_gravity = float(max(0.0, -gravity[2]))

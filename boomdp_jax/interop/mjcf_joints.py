@@ -15,6 +15,21 @@ _DRIVE_FIELDS = {
 }
 
 
+def check_joint_kinds(document: Document) -> None:
+    """Refuse joints that leave the plane, of which all else would only be a symptom.
+
+    Args:
+        document: the world.
+
+    Raises:
+        ValueError: a joint is neither a hinge nor a slide.
+    """
+    for joint in range(document.model.njnt):
+        kind = _kind(document, joint)
+        if kind not in ("hinge", "slide"):
+            document.refuse("joint", joint, "a hinge or a slide", kind)
+
+
 def read_joints(document: Document) -> list[dict]:
     """What holds each body: a pin, a drawer, a weld, or nothing.
 
@@ -66,8 +81,6 @@ def _check_joint(document: Document, joint: int) -> None:
         document.refuse("joint", joint, "an axis along z", axis)
     if kind == "slide":
         document.direction("joint", joint, data.xaxis[joint])
-    if kind not in ("hinge", "slide"):
-        document.refuse("joint", joint, "a hinge or a slide", kind)
     dof = int(model.jnt_dofadr[joint])
     for field, value in (
         ("stiffness", model.jnt_stiffness[joint]),

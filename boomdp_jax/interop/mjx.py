@@ -17,6 +17,7 @@ from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.interop.mjcf_document import load_mujoco
 from boomdp_jax.interop.mjcf_export import to_mjcf
 from boomdp_jax.physics.params import Params
+from boomdp_jax.physics.same_bodies import check_same_bodies
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 _WRITTEN = {
@@ -70,11 +71,17 @@ def randomise_mjx(
         the tree of its `in_axes` for `jax.vmap`: 0 for these, None for others.
 
     Raises:
-        ValueError: draws of several structures, or a model that is not of their
-            document; also what `to_mjcf` refuses.
+        ValueError: draws of several structures or of other bodies, or a model that is
+            not of their document or none of MJX; also what `to_mjcf` refuses.
         ImportError: MuJoCo is not installed.
     """
+    if not all(hasattr(model, name) for name in ("tree_replace", "opt")):
+        raise ValueError(
+            "model: expected a mujoco.mjx.Model (mujoco.mjx.put_model makes one of an "
+            f"MjModel) or a brax.System, got {type(model).__name__}"
+        )
     if isinstance(draws, Posterior):
+        check_same_bodies(draws.spec, spec, "draws")
         thinned = draws.thin(draws.num_draws if num_draws is None else num_draws)
         draws = thinned.params
     host = jax.tree.map(np.asarray, draws)

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from boomdp_jax.cli.main import main
 from boomdp_jax.core.history_file import load_transitions
 from boomdp_jax.physics import rollout
 from boomdp_jax.physics.scene_file import load_scene
+from tests.inference.posteriors import make_posterior
 
 DENSITY, HALF_EXTENTS, DT = 10.0, (0.5, 0.3), 0.02
 MASS = DENSITY * 4 * HALF_EXTENTS[0] * HALF_EXTENTS[1]
@@ -162,6 +164,91 @@ def test_another_step_length_is_told_on_standard_error(
     assert output.err.splitlines() == [
         "boomdp_jax: warning: a.npz: dt: 0.05 s overrides the scene's 0.02 s"
     ]
+
+
+def _change_scene(**fields) -> None:
+    scene = json.loads(Path("scene.json").read_text())
+    Path("scene.json").write_text(json.dumps(scene | fields))
+
+
+def _notes(capsys: pytest.CaptureFixture) -> list[str]:
+    lines = capsys.readouterr().err.splitlines()
+    return [line.removeprefix("boomdp_jax: note: ") for line in lines]
+
+
+def test_what_stands_in_for_unknown_numbers_is_told(
+    folder: Path, capsys: pytest.CaptureFixture
+):
+    unknown = {"actuator": ["gain", "delay"], "center_of_mass": True, "wheel": 1}
+    _change_scene(unknown=unknown)
+    np.savez("a.npz", action=_action(2, (0.5, 0.2, 0.1)))
+    _simulate()
+    assert _notes(capsys) == [
+        "scene.json: unknown constraints are taken to be absent",
+        "scene.json: unknown.actuator.gain is taken to be 1",
+        "scene.json: unknown.actuator.delay is taken to be 0 s",
+        "scene.json: unknown.center_of_mass is taken to be where the pose is",
+    ]
+
+
+def test_what_stands_in_for_unknown_contact_is_told(
+    folder: Path, capsys: pytest.CaptureFixture
+):
+    bodies = json.loads(Path("scene.json").read_text())["bodies"]
+    bodies[0]["contact"] = {"friction": 0.3, "restitution": None}
+    bodies[1]["contact"] = {"friction": None}
+    # Refused afterwards, which spares the test a program with contact.
+    del bodies[1]["density"]
+    _change_scene(bodies=bodies)
+    np.savez("a.npz", action=_action(1, (0.5, 0.2, 0.1)))
+    assert main("simulate scene.json --actions a.npz --out out.npz".split()) == 2
+    assert _notes(capsys)[:-1] == [
+        "scene.json: body 'box': unknown contact.friction is taken to be 0.5",
+        "scene.json: body 'wall': unknown contact.restitution is taken to be 0",
+    ]
+
+
+def test_a_start_off_a_joint_is_told(folder: Path, capsys: pytest.CaptureFixture):
+    pin = {"type": "revolute", "a": "box", "b": "world", "anchor_a": [0, 0]}
+    _change_scene(constraints=[pin | {"anchor_b": [1, 2]}])
+    np.savez("a.npz", action=_action(2, (0.0, 0.0, 0.1)))
+    _simulate()
+    assert _notes(capsys) == []
+    start = np.zeros((2, 6))
+    start[1, :2] = [1.0, 7.0]
+    np.savez("a.npz", action=_action(2, (0.0, 0.0, 0.1)), initial_state=start)
+    _simulate()
+    off = (
+        "body 'box' starts 5 m off its pin to the world; the first step takes it there"
+    )
+    assert _notes(capsys) == [f"a.npz: initial_state: {off}"]
+    table = load_transitions("out.npz")
+    np.testing.assert_allclose(table.next_state[0, 1, :2], [1, 2], atol=1e-6)
+    np.savez("a.npz", action=_action(2, (0.0, 0.0, 0.1)))
+    _change_scene(constraints=[pin | {"anchor_b": [1, -3]}])
+    _simulate()
+    assert _notes(capsys) == [f"scene.json: pose: {off}"]
+
+
+def test_a_posterior_of_another_outline_is_refused(
+    folder: Path, capsys: pytest.CaptureFixture
+):
+    spec = load_scene("scene.json")
+    draws = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), spec.params())
+    make_posterior(spec, draws, draws).save("post.npz")
+    np.savez("a.npz", action=_action(2, (0.5, 0.2, 0.1)))
+    _simulate("--posterior post.npz --draw 1")
+    Path("out.npz").unlink()
+    bodies = json.loads(Path("scene.json").read_text())["bodies"]
+    bodies[1]["shape"]["half_extents"] = [5, 3]
+    _change_scene(bodies=bodies)
+    command = "simulate scene.json --actions a.npz --out out.npz --posterior post.npz"
+    assert main(command.split()) == 2
+    assert capsys.readouterr().err.splitlines() == [
+        "boomdp_jax: error: post.npz: body 'box': shape.half_extents: expected "
+        "[5.0, 3.0], as in scene.json, got [0.5, 0.3]"
+    ]
+    assert not Path("out.npz").exists()
 
 
 def test_a_missing_start_is_refused(folder: Path, capsys: pytest.CaptureFixture):

@@ -112,6 +112,19 @@ def test_runs_that_differ_are_not_put_side_by_side(folders, tmp_path):
         check_comparable([loaded, load_run(short)])
 
 
+@pytest.mark.parametrize("options", ["", " --out new.png"])
+def test_what_is_no_run_is_named(tmp_path, monkeypatch, capsys, options):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    where = {"nothere": "none there", ".": "one without run.json", "file": "a file"}
+    for name, got in where.items():
+        assert cli.main(f"plot {name}{options}".split()) == 2
+        assert capsys.readouterr().err.splitlines() == [
+            f"boomdp_jax: error: {name}: is not a run: expected a folder written by "
+            f"`run`, got {got}"
+        ]
+
+
 def test_the_command_draws_and_tells(folders, capsys):
     pytest.importorskip("matplotlib")
     command = ["plot", *map(str, folders)]

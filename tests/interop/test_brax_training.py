@@ -10,6 +10,7 @@ import pytest
 
 from boomdp_jax.envs import Pendulum
 from boomdp_jax.interop import BraxTask, train_ppo
+from boomdp_jax.physics.scene_spec import scene_spec_from_dict
 from tests.inference.posteriors import table_posterior
 
 with warnings.catch_warnings():
@@ -74,6 +75,15 @@ def test_the_trainer_is_left_as_it_was_when_training_fails():
 def test_a_posterior_of_other_bodies_is_refused():
     with pytest.raises(ValueError, match="draws: expected bodies bob, got table"):
         train_ppo(BraxTask(Pendulum()), draws=table_posterior(num_draws=8))
+
+
+def test_a_posterior_of_another_outline_is_refused():
+    env = Pendulum()
+    content = env.spec.to_dict()
+    content["bodies"][0]["shape"] = {"type": "circle", "radius": 9.0}
+    posterior = table_posterior(num_draws=8, spec=scene_spec_from_dict(content))
+    with pytest.raises(ValueError, match="draws: body 'bob': shape"):
+        train_ppo(BraxTask(env), draws=posterior)
 
 
 def test_a_negative_number_of_steps_is_refused():

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from boomdp_jax.interop import save_mjcf, to_mjcf
-from boomdp_jax.interop.mjcf_export import _check_types
+from boomdp_jax.interop.mjcf_export import _check_types, _read_options
 from boomdp_jax.physics.params import Actuator
 from tests.interop.mjcf_worlds import (
     ball,
@@ -314,6 +314,24 @@ def test_swapped_arguments_are_refused(order, message):
     given = {"spec": spec, "params": spec.params()}
     with pytest.raises(ValueError, match=message):
         _check_types(*(given.get(name, name) for name in order.split()))
+
+
+@pytest.mark.parametrize("time_step", [-1.0, 0.0, float("nan"), float("inf")])
+def test_a_time_step_that_is_none_is_refused(time_step):
+    spec = WORLDS["free body"][0]
+    message = f"time_step: expected a finite number above 0, got {time_step}"
+    with pytest.raises(ValueError, match=message):
+        to_mjcf(spec, spec.params(), time_step=time_step)
+
+
+def test_options_of_other_types_are_refused():
+    # The public functions begin with this; here their types would be checked before.
+    with pytest.raises(ValueError, match=r"time_step: expected a finite .* got 'x'"):
+        _read_options("x", "Euler")
+    with pytest.raises(ValueError, match=r"integrator: expected .* RK4, got 'foo'"):
+        _read_options(0.002, "foo")
+    # A number of NumPy's would be written with its type's name.
+    assert repr(_read_options(np.float64(0.002), "RK4")) == "0.002"
 
 
 def test_params_of_another_scene_are_refused():

@@ -35,6 +35,10 @@ REFUSALS = {
         document(joints="<freejoint/>"),
         "expected a hinge or a slide, got free",
     ),
+    "free sphere": (
+        document(joints="<freejoint/>", geom='type="sphere" size="0.1"'),
+        "joint 'joint0': expected a hinge or a slide, got free",
+    ),
     "tilted hinge": (
         document(joints='<joint type="hinge" axis="0 1 1"/>'),
         "joint 'joint0': expected an axis along z",

@@ -274,6 +274,21 @@ def test_one_hypothesis_is_refused():
     )
 
 
+def test_a_model_for_the_host_is_refused():
+    spec = arm(viscous=[0.3, 8.0])
+    draws = batch(spec)
+    model = mujoco.MjModel.from_xml_string(document(spec, draws))
+    with pytest.raises(ValueError, match=r"expected a mujoco.mjx.Model .* got MjModel"):
+        randomise_mjx(model, spec, draws)
+
+
+def test_a_posterior_of_other_outlines_is_refused():
+    spec, wide = (scene([box("a", (0, 0, 0), half=(x, 0.1))]) for x in (0.2, 2.0))
+    belief = posterior(wide, batch(wide), [0.2, 0.3, 0.5])
+    text = to_mjcf(spec, spec.params())
+    refused("draws: body 'a': shape.half_extents: expected", belief, spec, text)
+
+
 def test_several_structures_are_refused():
     spec = arm(viscous=[0.3, 8.0])
     draws = batch(spec)
