@@ -260,8 +260,9 @@ def _diagnostics(
         "reasons": reasons,
         "notes": [*notes, *further],
         "method": method,
-        "r_hat": max(r_hat, default=None),
-        "effective_sample_size": min(sizes, default=None),
+        # Of NumPy, for which NaN, not judged, is the worst.
+        "r_hat": float(np.max(r_hat)) if r_hat else None,
+        "effective_sample_size": float(np.min(sizes)) if sizes else None,
         "jump_acceptance": min(jumps, default=None),
         "residual": residual,
     }

@@ -77,6 +77,20 @@ def test_counts_that_are_too_small_are_refused_at_once(method, count, message):
         infer(KEY, SPEC, history_of(2), method=method, **count)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("method", "num_each"), [("enumerate", 2), ("smc", 1)])
+def test_few_draws_are_returned_and_not_judged(method, num_each):
+    """Of `smc` two draws of four chains are spread over sixteen islands."""
+    posterior = infer(KEY, SPEC, history_of(0), method=method, num_samples=2)
+    diagnostics = posterior.to_json()["diagnostics"]
+    assert not diagnostics["ok"]
+    assert (
+        "box: too few draws to judge: expected at least 4 of each chain, got "
+        f"{num_each}" in diagnostics["reasons"]
+    )
+    assert diagnostics["r_hat"] is None
+
+
 def test_an_empty_table_has_room_for_a_row():
     (padded,) = padded_histories([history_of(0)])
     assert (padded.capacity, int(padded.num_transitions)) == (1, 0)

@@ -8,24 +8,46 @@ from boomdp_jax.inference.structure_chain import ChainDraws
 from boomdp_jax.inference.target import StructureTarget
 
 
-def test_an_angle_close_to_zero_is_judged_beyond_single_precision():
-    """Its cosine is one to single precision, but for a few draws far out."""
-    rng = np.random.default_rng(0)
-    z = (4e-5 * rng.standard_normal((4, 256, 1))).astype(np.float32)
-    target = StructureTarget(
+def one_angle() -> StructureTarget:
+    """A target of one coordinate, an angle, and one structure."""
+    return StructureTarget(
         log_likelihood=lambda z, active: jnp.zeros(()),
         structures=jnp.ones((1, 0), bool),
         log_prior=jnp.zeros(1),
         slot=jnp.full(1, -1, jnp.int32),
         period=jnp.full(1, np.pi, jnp.float32),
     )
+
+
+def test_an_angle_close_to_zero_is_judged_beyond_single_precision():
+    """Its cosine is one to single precision, but for a few draws far out."""
+    rng = np.random.default_rng(0)
+    z = (4e-5 * rng.standard_normal((4, 256, 1))).astype(np.float32)
     draws = ChainDraws(
         jnp.zeros((4, 256), jnp.int32),
         jnp.asarray(z),
         jnp.asarray(rng.standard_normal((4, 256))),
     )
-    verdict = diagnose_chains(target, draws)
+    verdict = diagnose_chains(one_angle(), draws)
     cosine = np.cos(2.0 * z[..., 0].astype(float))
     expected = float(effective_sample_size(cosine))
     assert verdict.effective_sample_size["z_0_cos"] == pytest.approx(expected)
     assert verdict.ok, verdict.reasons
+
+
+@pytest.mark.parametrize("num_each", [1, 3])
+def test_few_draws_are_not_judged_and_it_says_so(num_each):
+    """Halves of chains cannot be compared, nor can it be told that one is stuck."""
+    rng = np.random.default_rng(1)
+    draws = ChainDraws(
+        jnp.zeros((2, num_each), jnp.int32),
+        jnp.asarray(rng.standard_normal((2, num_each, 1))),
+        jnp.asarray(rng.standard_normal((2, 1)).repeat(num_each, axis=1)),
+    )
+    verdict = diagnose_chains(one_angle(), draws)
+    assert verdict.reasons == [
+        f"too few draws to judge: expected at least 4 of each chain, got {num_each}"
+    ]
+    assert not verdict.ok
+    assert np.isnan(verdict.r_hat["log_density"])
+    assert np.isnan(verdict.effective_sample_size["log_density"])
