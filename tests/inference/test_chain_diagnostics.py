@@ -3,9 +3,12 @@ import numpy as np
 import pytest
 from numpyro.diagnostics import effective_sample_size
 
+from boomdp_jax.inference.assemble import _named
+from boomdp_jax.inference.block import make_block
 from boomdp_jax.inference.chain_diagnostics import diagnose_chains
 from boomdp_jax.inference.structure_chain import ChainDraws
 from boomdp_jax.inference.target import StructureTarget
+from tests.inference.recordings import box_scene, free_box
 
 
 def one_angle() -> StructureTarget:
@@ -51,3 +54,20 @@ def test_few_draws_are_not_judged_and_it_says_so(num_each):
     assert not verdict.ok
     assert np.isnan(verdict.r_hat["log_density"])
     assert np.isnan(verdict.effective_sample_size["log_density"])
+
+
+def test_reasons_name_what_people_know():
+    """A box's density is coordinate 0, a wheel's take 1 to 8, its heading is 3."""
+    spec = box_scene({"wheel": 1, "ground": 1})
+    block = make_block(spec, (0,), free_box(np.random.default_rng(0), 2))
+    reasons = {
+        "z_0: R-hat is 2.000, above 1.05": "box.density: R-hat is 2.000, above 1.05",
+        "z_2: R-hat is nan": "box.wheel.position[1]: R-hat is nan",
+        "z_3_cos: R-hat is 2": "cos 2 box.wheel.heading: R-hat is 2",
+        "z_3_sin: R-hat is 2": "sin 2 box.wheel.heading: R-hat is 2",
+        "z_10: R-hat is 2": "box.ground.knee_speed: R-hat is 2",
+        "slot_1: R-hat is 2": "whether box.ground exists: R-hat is 2",
+        "log_density: R-hat is 2": "log_density: R-hat is 2",
+        "chains [0] never moved": "chains [0] never moved",
+    }
+    assert _named(spec, block, list(reasons)) == list(reasons.values())
