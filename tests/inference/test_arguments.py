@@ -1,12 +1,15 @@
 """What inference says to arguments that are none."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 
 from boomdp_jax.core import make_history
 from boomdp_jax.inference import infer, infer_batch
 from boomdp_jax.inference.arguments import check_arguments, check_history
+from boomdp_jax.inference.block import make_block
 from boomdp_jax.inference.infer import padded_histories
 from boomdp_jax.physics import scene_spec_from_dict
 
@@ -101,3 +104,22 @@ def test_an_empty_history_gives_the_prior():
         KEY, SPEC, history_of(0), method="map", likelihood="one-step", num_samples=50
     )
     assert np.isfinite(posterior.log_evidence)
+
+
+def test_a_block_of_no_rows_has_a_density():
+    target = make_block(SPEC, (0,), history_of(0)).target
+    first, z = jnp.asarray(0), jnp.zeros(target.dim)
+    expected = target.log_prior_density(first, z)
+    np.testing.assert_allclose(target.log_density(first, z), expected)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["svi", "nuts"])
+def test_an_empty_history_gives_the_prior_of_one_structure(method):
+    """Quantiles of the density, with the error of 300 independent draws."""
+    posterior = infer(KEY, SPEC, history_of(0), method=method, structure={})
+    density = np.asarray(posterior.params.density[:, 0])
+    slack = scipy.stats.norm.isf(1e-4) * np.sqrt(0.25 / 300)
+    for p in (0.1, 0.5, 0.9):
+        quantile = scipy.stats.lognorm(1.5, scale=30.0).ppf(p)
+        assert np.mean(density < quantile) == pytest.approx(p, abs=slack)
