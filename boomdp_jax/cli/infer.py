@@ -146,4 +146,5 @@ def _options(arguments: argparse.Namespace) -> dict[str, Any]:
         "method": arguments.method,
         "likelihood": arguments.likelihood,
         "horizon": arguments.horizon,
+        "outliers": arguments.outliers,
     }

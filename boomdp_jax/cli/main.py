@@ -14,6 +14,8 @@ METHODS = ("auto", "rj", "enumerate", "smc", "nuts", "svi", "laplace", "map")
 LIKELIHOODS = ("auto", "filtered", "one-step", "open-loop")
 """Likelihoods of readings that exist."""
 
+OUTLIERS = ("none", "student-t")
+"""Laws of the readings' noise that exist."""
 
 TASKS = ("pendulum", "cart", "acrobot", "living-room", "namo")
 """Tasks of `run`."""
@@ -141,6 +143,13 @@ def _add_infer(parser: argparse.ArgumentParser) -> None:
         type=_whole(1),
         metavar="K",
         help="of open-loop: most steps of a prediction; default: no limit",
+    )
+    add(
+        "--outliers",
+        choices=OUTLIERS,
+        default="none",
+        help="student-t: of readings with gross errors, which it takes little heed of;"
+        " default: none, noise is normal",
     )
     add("--seed", type=_whole(0, 2**32 - 1), default=0)
     add(

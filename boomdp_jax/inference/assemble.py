@@ -12,10 +12,12 @@ from boomdp_jax.inference.contact_numbers import with_contact_numbers
 from boomdp_jax.inference.decode import decode
 from boomdp_jax.inference.evidence_report import BlockResult, report_evidence
 from boomdp_jax.inference.layout import BODY_NUMBERS
+from boomdp_jax.inference.model_sites import coordinate_names
 from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.noise_level import prior_noise
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.residual_report import report_residuals
+from boomdp_jax.inference.slot_names import slot_names
 from boomdp_jax.physics.constraint_spec import JOINTS, KINDS
 from boomdp_jax.physics.params import WORLD, Params, empty_params
 from boomdp_jax.physics.scene_spec import SceneSpec
@@ -249,7 +251,8 @@ def _diagnostics(
     for block, draws, place, _ in results:
         names = "+".join(spec.names[i] for i in block.bodies)
         verdict = draws.diagnostics[place]
-        reasons += [f"{names}: {reason}" for reason in verdict.reasons]
+        named = _named(spec, block, verdict.reasons)
+        reasons += [f"{names}: {reason}" for reason in named]
         r_hat += list(verdict.r_hat.values())
         sizes += list(verdict.effective_sample_size.values())
         if "jump" in verdict.acceptance:
@@ -260,8 +263,27 @@ def _diagnostics(
         "reasons": reasons,
         "notes": [*notes, *further],
         "method": method,
-        "r_hat": max(r_hat, default=None),
-        "effective_sample_size": min(sizes, default=None),
+        # Of NumPy, for which NaN, not judged, is the worst.
+        "r_hat": float(np.max(r_hat)) if r_hat else None,
+        "effective_sample_size": float(np.min(sizes)) if sizes else None,
         "jump_acceptance": min(jumps, default=None),
         "residual": residual,
     }
+
+
+def _named(spec: SceneSpec, block: Block, reasons: list[str]) -> list[str]:
+    """Reasons with names of numbers and constraints in place of where they are kept."""
+    names = tuple(spec.names[i] for i in block.bodies)
+    numbers = coordinate_names(names, block.layout)
+    slots = slot_names(names, block.layout)
+    kept = {f"z_{i}": name for i, name in enumerate(numbers)}
+    # Directions are judged by functions that half a turn does not change.
+    kept |= {f"z_{i}_cos": f"cos 2 {name}" for i, name in enumerate(numbers)}
+    kept |= {f"z_{i}_sin": f"sin 2 {name}" for i, name in enumerate(numbers)}
+    for i, slot in enumerate(block.layout.slots):
+        kept[f"slot_{i}"] = f"whether {slots[slot]} exists"
+    found = []
+    for reason in reasons:
+        head, colon, rest = reason.partition(":")
+        found.append(f"{kept.get(head, head)}{colon}{rest}")
+    return found

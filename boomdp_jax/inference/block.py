@@ -66,6 +66,8 @@ def make_block(
     Returns:
         The block.
     """
+    # An empty table needs room for one row, from which shapes can be told.
+    history = history.padded(max(history.capacity, 1))
     options = read_prior(spec.prior, spec.source)
     contact, inferred = None, ()
     if touching is not None and touching.pairs[list(bodies)].any():

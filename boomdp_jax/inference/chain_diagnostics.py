@@ -6,6 +6,7 @@ constant, of any scalar that the caller adds (a total mass, a prediction), and o
 coordinates within the most probable structure.
 """
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -15,6 +16,9 @@ from numpyro.diagnostics import effective_sample_size, split_gelman_rubin
 from boomdp_jax.inference.moves import MOVES
 from boomdp_jax.inference.structure_chain import ChainDraws
 from boomdp_jax.inference.target import StructureTarget
+
+# Draws of each chain below which halves of chains cannot be compared.
+_FEWEST_DRAWS = 4
 
 
 @runtime_checkable
@@ -63,7 +67,8 @@ def diagnose_chains(
 
     Returns:
         The verdict. `ok` is false with a reason for every number that fails, for a
-        log-density that is not finite, and for a chain that never moved.
+        log-density that is not finite, for a chain that never moved, and where there
+        are too few draws to tell.
     """
     structure = np.asarray(draws.structure)
     log_density = np.asarray(draws.log_density)
@@ -75,10 +80,52 @@ def diagnose_chains(
     for slot in range(active.shape[-1]):
         series[f"slot_{slot}"] = active[..., slot].astype(float)
     series |= {name: np.asarray(value) for name, value in (scalars or {}).items()}
-    series = {name: value for name, value in series.items() if np.ptp(value) > 0}
+    num_each = structure.shape[1]
+    is_judged = num_each >= _FEWEST_DRAWS
+    if is_judged:
+        series = {name: value for name, value in series.items() if np.ptp(value) > 0}
     series |= _within_structure(target, structure, np.asarray(draws.z))
+    r_hat, size, doubts = judge_series(
+        series, num_each, max_r_hat=max_r_hat, min_sample_size=min_sample_size
+    )
+    reasons += doubts
+    stuck = np.flatnonzero(np.ptp(log_density, axis=1) == 0)
+    # Few draws are equal by chance, and a single one always is.
+    if stuck.size and is_judged:
+        reasons.append(f"chains {stuck.tolist()} never moved")
+    acceptance = {} if info is None else _acceptance(info)
+    return ChainDiagnostics(not reasons, reasons, r_hat, size, acceptance)
+
+
+def judge_series(
+    series: Mapping[str, np.ndarray],
+    num_each: int,
+    *,
+    max_r_hat: float = 1.05,
+    min_sample_size: float = 100.0,
+) -> tuple[dict[str, float], dict[str, float], list[str]]:
+    """Split R-hat and effective sample size of numbers, and what is wrong with them.
+
+    Args:
+        series: numbers by name, `[chain, draw]`.
+        num_each: draws of each chain.
+        max_r_hat: largest split R-hat that passes.
+        min_sample_size: smallest effective sample size that passes.
+
+    Returns:
+        R-hat by name, effective sample size by name, and a reason for every number that
+        fails. With too few draws to tell, both are NaN, and a single reason says so.
+    """
+    if num_each < _FEWEST_DRAWS:
+        unknown = dict.fromkeys(series, float("nan"))
+        reason = (
+            f"too few draws to judge: expected at least {_FEWEST_DRAWS} of each chain, "
+            f"got {num_each}"
+        )
+        return unknown, dict(unknown), [reason]
     r_hat = {name: float(split_gelman_rubin(value)) for name, value in series.items()}
     size = {name: float(effective_sample_size(value)) for name, value in series.items()}
+    reasons = []
     for name in series:
         if not r_hat[name] <= max_r_hat:
             reasons.append(f"{name}: R-hat is {r_hat[name]:.3f}, above {max_r_hat}")
@@ -87,11 +134,7 @@ def diagnose_chains(
                 f"{name}: effective sample size is {size[name]:.0f}, below "
                 f"{min_sample_size:.0f}"
             )
-    stuck = np.flatnonzero(np.ptp(log_density, axis=1) == 0)
-    if stuck.size:
-        reasons.append(f"chains {stuck.tolist()} never moved")
-    acceptance = {} if info is None else _acceptance(info)
-    return ChainDiagnostics(not reasons, reasons, r_hat, size, acceptance)
+    return r_hat, size, reasons
 
 
 def _within_structure(

@@ -31,6 +31,7 @@ from boomdp_jax.inference.sample import sample_blocks
 from boomdp_jax.inference.structure_draws import SampleSettings
 from boomdp_jax.inference.svi import run_svi
 from boomdp_jax.inference.touching import find_touching
+from boomdp_jax.inference.unread import unread_notes
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 METHODS = ("auto", "rj", "enumerate", "smc", "nuts", "svi", "laplace", "map")
@@ -230,13 +231,11 @@ def infer_batch(
     if outliers != "none":
         entries["degrees_of_freedom"] = OUTLIERS[outliers]
     posteriors = [with_diagnostics(posterior, (), entries) for posterior in posteriors]
-    if outliers == "none":
-        posteriors = [
-            _with_notes(posterior, [*chosen.notes, *outlier_notes(spec, history)])
-            for posterior, spec, history in zip(
-                posteriors, specs, histories, strict=True
-            )
-        ]
+    for index, (spec, history) in enumerate(zip(specs, histories, strict=True)):
+        more = unread_notes(spec, history)
+        if outliers == "none":
+            more += [*chosen.notes, *outlier_notes(spec, history)]
+        posteriors[index] = _with_notes(posteriors[index], more)
     seed = seed_of(key)
     return [dataclasses.replace(posterior, seed=seed) for posterior in posteriors]
 

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any
 
 import equinox as eqx
@@ -9,9 +10,11 @@ import jax
 import numpy as np
 
 from boomdp_jax.core.arrays import Key, on_device
+from boomdp_jax.core.checked_input import whole_number
 from boomdp_jax.core.compile_time import CompileClock
 from boomdp_jax.core.history import History
 from boomdp_jax.core.versions import library_versions
+from boomdp_jax.inference.arguments import check_arguments
 from boomdp_jax.inference.assemble import assemble_posterior
 from boomdp_jax.inference.chain_diagnostics import diagnose_chains
 from boomdp_jax.inference.coordinates import Coordinates
@@ -92,12 +95,19 @@ def infer_kinds(
         A posterior of each scene, and which bodies are of one kind.
 
     Raises:
+        TypeError: a key, scene, history, kinds or prior that are none.
         ValueError: a body tied to another, or with other possible constraints than the
             first; kinds learnt of other ones; an option that makes no sense.
     """
-    specs = [specs] if isinstance(specs, SceneSpec) else list(specs)
-    histories = [histories] if isinstance(histories, History) else list(histories)
-    _check_options(specs, histories, prior_kinds, concentration, sampler, prior)
+    specs = [specs] if isinstance(specs, SceneSpec) else specs
+    histories = [histories] if isinstance(histories, History) else histories
+    check_arguments(key, specs, histories, None)
+    if not specs:
+        raise ValueError("specs: expected at least one, got none")
+    _check_options(prior_kinds, concentration, sampler, prior)
+    num_chains = whole_number("num_chains", num_chains, 1)
+    num_warmup = whole_number("num_warmup", num_warmup, 0)
+    num_samples = whole_number("num_samples", num_samples, 1)
     if prior_kinds is not None:
         prior = prior_kinds.prior
         use_outlines = prior_kinds.num_features > 0 and use_outlines
@@ -199,19 +209,14 @@ def infer_kinds_of(
     )
 
 
-def _check_options(
-    specs, histories, prior_kinds, concentration, sampler, prior
-) -> None:
-    if len(specs) != len(histories):
-        raise ValueError(
-            f"histories: expected one per scene, {len(specs)}, got {len(histories)}"
+def _check_options(prior_kinds, concentration, sampler, prior) -> None:
+    if prior_kinds is not None and not isinstance(prior_kinds, LearntKinds):
+        raise TypeError(
+            "prior_kinds: expected LearntKinds, as load_kinds and KindsPosterior.kinds "
+            f"give; got {prior_kinds!r}"
         )
-    for spec, history in zip(specs, histories, strict=True):
-        if history.num_bodies != spec.num_bodies:
-            raise ValueError(
-                f"{spec.source}: history: expected {spec.num_bodies} bodies, got "
-                f"{history.num_bodies}"
-            )
+    if prior is not None and not isinstance(prior, KindPrior):
+        raise TypeError(f"prior: expected a KindPrior; got {prior!r}")
     if sampler not in SAMPLERS:
         raise ValueError(
             f"sampler: expected one of {', '.join(SAMPLERS)}; got {sampler!r}"
@@ -221,7 +226,10 @@ def _check_options(
             "prior_kinds: expected the collapsed sampler and no other prior with it"
         )
     least = 0.0 if prior_kinds is not None else np.finfo(float).tiny
-    if concentration is not None and not least <= concentration < np.inf:
+    is_number = isinstance(concentration, Real) and not isinstance(concentration, bool)
+    if concentration is not None and not (
+        is_number and least <= concentration < np.inf
+    ):
         raise ValueError(
             "concentration: expected a positive number, or 0 with prior_kinds; got "
             f"{concentration!r}"

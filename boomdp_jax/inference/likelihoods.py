@@ -7,6 +7,7 @@ import numpy as np
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.exact_starts import ExactStarts, covered_rows
 from boomdp_jax.inference.track_data import track_data
+from boomdp_jax.inference.unread import is_unread
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 LIKELIHOODS = ("auto", "filtered", "one-step", "open-loop")
@@ -58,7 +59,8 @@ class ChosenLikelihood(NamedTuple):
             A note where rows are left out, since no prediction leads through them.
 
         Raises:
-            ValueError: there are readings, and none of them can be predicted.
+            ValueError: there are readings, and none of them can be predicted; or there
+                are rows, and no reading of any body.
         """
         if self.starts is None:
             return []
@@ -67,7 +69,8 @@ class ChosenLikelihood(NamedTuple):
         left = is_read & ~covered_rows(data, self.starts)
         num, num_left = int(np.sum(is_read)), int(np.sum(left))
         names = "+".join(spec.names[body] for body in bodies)
-        if num and num_left == num:
+        # Of a body that was not seen while others were, the prior is as good as ever.
+        if num_left == num and (num or is_unread(spec, history)):
             raise ValueError(
                 f"{spec.source}: {names}: likelihood {self.name!r}: expected rows that "
                 "start from a reading of every pose, velocity and spin; got none; "

@@ -18,7 +18,7 @@ from numpyro.distributions import constraints, transforms
 
 from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.body_numbers import number_scale
-from boomdp_jax.inference.layout import BODY_NUMBERS, BodyNumber, SlotKey
+from boomdp_jax.inference.layout import BODY_NUMBERS, BodyNumber, Layout, SlotKey
 from boomdp_jax.inference.prior import LOGARITHMIC
 from boomdp_jax.inference.slot_names import slot_names
 from boomdp_jax.physics.params import WORLD
@@ -195,6 +195,34 @@ def block_sites(block: Block, names: tuple[str, ...]) -> tuple[Site, ...]:
                 for place in free
             ]
     return tuple(kept)
+
+
+def coordinate_names(names: tuple[str, ...], layout: Layout) -> list[str]:
+    """Which number each coordinate of a block stands for.
+
+    Args:
+        names: of its bodies.
+        layout: of its coordinates.
+
+    Returns:
+        Names as sample sites have them, `table.ground.knee_speed`, with a place where
+        there are several coordinates to a number, `table.revolute.anchor_a[1]`.
+    """
+    found = [f"{name}.density" for name in names] + [""] * (layout.dim - len(names))
+
+    def put(name: str, start: int, count: int) -> None:
+        for place in range(count):
+            found[start + place] = f"{name}[{place}]" if count > 1 else name
+
+    for slot, name in slot_names(names, layout).items():
+        for field, _, first, count in _NUMBERS[slot.kind]:
+            put(f"{name}.{field}", slot.start + first, count)
+    for number in layout.numbers:
+        name = f"{names[number.body]}.{number.name}"
+        put(name, number.start, BODY_NUMBERS[number.name])
+    for name in layout.contact:
+        put(f"contact.{name}", layout.contact_coordinate(name), 1)
+    return found
 
 
 def _body_site(number: BodyNumber, name: str, coordinates: Any) -> Site:

@@ -324,9 +324,14 @@ def _lineages(root: np.ndarray) -> np.ndarray:
 
 
 def _reach(before: np.ndarray, after: np.ndarray) -> float:
-    """Mean square of a move over the variance, of the middle one of all numbers."""
+    """Mean square of a move over the variance, of the middle one of all numbers.
+
+    Zero where no number varies, as with a single draw.
+    """
     spread = after.var(axis=0)
     seen = spread > 0
+    if not np.any(seen):
+        return 0.0
     square = np.mean((after - before)[:, seen] ** 2, axis=0)
     return float(np.median(square / spread[seen]))
 

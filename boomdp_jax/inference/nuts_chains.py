@@ -25,7 +25,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from numpyro.diagnostics import effective_sample_size, split_gelman_rubin
 from numpyro.infer.hmc import hmc
 from numpyro.infer.util import potential_energy
 
@@ -33,7 +32,7 @@ from boomdp_jax.core.arrays import Key
 from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.core.spread import Program, run_each
 from boomdp_jax.inference.block import stack_blocks
-from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics
+from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics, judge_series
 from boomdp_jax.inference.find_modes import find_single_step_modes
 from boomdp_jax.inference.fit import FitSettings
 from boomdp_jax.inference.mixture_building import laplace_mixture
@@ -55,8 +54,6 @@ _LAPLACE_DRAWS = 20.0
 # between sticking and slipping meet a kink and diverge now and then: 0.1 to 0.4 % of
 # the draws of pinned boxes, 0.7 % of those of a wheeled one, with R-hat under 1.01.
 _MAX_DIVERGENT = 0.01
-# Largest split R-hat and smallest effective sample size that pass, as for jumps.
-_MAX_R_HAT, _MIN_SAMPLE_SIZE = 1.05, 100.0
 
 
 class Start(NamedTuple):
@@ -345,17 +342,8 @@ def _diagnose(
                 series[f"sin 2 {label}"] = np.sin(2.0 * column)
             else:
                 series[label] = column
-    r_hat = {name: float(split_gelman_rubin(x)) for name, x in series.items()}
-    size = {name: float(effective_sample_size(x)) for name, x in series.items()}
-    reasons = []
-    for name in series:
-        if not r_hat[name] <= _MAX_R_HAT:
-            reasons.append(f"{name}: R-hat is {r_hat[name]:.3f}, above {_MAX_R_HAT}")
-        if not size[name] >= _MIN_SAMPLE_SIZE:
-            reasons.append(
-                f"{name}: effective sample size is {size[name]:.0f}, below "
-                f"{_MIN_SAMPLE_SIZE:.0f}"
-            )
+    num_each = drawn.potential_energy.shape[1]
+    r_hat, size, reasons = judge_series(series, num_each)
     if num_divergent > _MAX_DIVERGENT * drawn.diverging.size:
         reasons.append(f"{num_divergent} of {drawn.diverging.size} draws diverged")
     return ChainDiagnostics(not reasons, reasons, r_hat, size, {})

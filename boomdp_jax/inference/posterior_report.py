@@ -266,7 +266,8 @@ def format_report(report: dict, structures: dict[str, float], num_draws: int) ->
     for ratio in report.get("mass_ratios", []):
         name = " / ".join(ratio["bodies"])
         lines.append(f"  {name:<20}{_quantity(ratio, [''])}")
-    lines += ["", "noise of one reading (sd)"]
+    freedom = report["diagnostics"].get("degrees_of_freedom")
+    lines += ["", f"noise of one reading ({_noise_meaning(freedom)})"]
     for name, noise in report["noise"].items():
         parts = [
             f"{channel.replace('_', ' ')} {_quantity(noise[channel], [unit])}"
@@ -283,6 +284,18 @@ def format_report(report: dict, structures: dict[str, float], num_draws: int) ->
     lines += _further_laws(diagnostics.get("residual", []))
     lines += [f"note          {note}" for note in diagnostics.get("notes", [])]
     return "\n".join(lines)
+
+
+def _noise_meaning(freedom: float | None) -> str:
+    """What the numbers of the noise are: of Student-t noise they are no sds."""
+    if freedom is None:
+        return "sd"
+    # No Student-t of two degrees of freedom or fewer has one.
+    times = np.sqrt(freedom / (freedom - 2.0)) if freedom > 2.0 else np.inf
+    return (
+        f"scale of Student-t noise of {freedom:g} degrees of freedom, whose sd is "
+        f"{times:.2f} times that; of impulses: sd"
+    )
 
 
 def _further_laws(entries: list[dict]) -> list[str]:

@@ -115,7 +115,8 @@ def run_svi(
     Args:
         key: random key.
         spec: the scene: outlines, what is known, what may exist.
-        history: recorded transitions. An empty one gives the prior.
+        history: recorded transitions. An empty one gives the prior, as far as it is
+            normal on the scales that are sampled: that of noise is not.
         structure: constraints that exist besides the known ones, as in `make_model`;
             default: the most probable ones, as in `run_nuts`.
         num_steps: gradient steps.

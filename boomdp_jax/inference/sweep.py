@@ -27,7 +27,7 @@ from boomdp_jax.core.history_file import load_history
 from boomdp_jax.core.json_file import check_same, read_json, write_json
 from boomdp_jax.core.versions import library_versions
 from boomdp_jax.inference.fixed_structure import Structure
-from boomdp_jax.inference.infer import METHODS, infer_batch, seed_of
+from boomdp_jax.inference.infer import METHODS, OUTLIERS, infer_batch, seed_of
 from boomdp_jax.inference.likelihoods import choose_likelihood
 from boomdp_jax.physics.scene_spec import SceneSpec
 
@@ -71,8 +71,8 @@ def infer_sweep(
         resume: whether units of this shard may be there already.
         num_rows: how many rows of each file to use, from the first; default: all.
         progress: show stages on standard error.
-        **options: `method`, `structure`, `likelihood`, `horizon`, `num_chains`,
-            `num_warmup` and `num_samples`, as `infer_batch` takes them.
+        **options: `method`, `structure`, `likelihood`, `horizon`, `outliers`,
+            `num_chains`, `num_warmup` and `num_samples`, as `infer_batch` takes them.
 
     Returns:
         The files of this shard's objects, in order.
@@ -105,6 +105,7 @@ def begin_sweep(
     structure: Structure | None = None,
     likelihood: str = "auto",
     horizon: int | None = None,
+    outliers: str = "none",
     num_chains: int = 4,
     num_warmup: int = 200,
     num_samples: int = 500,
@@ -122,6 +123,7 @@ def begin_sweep(
         structure: as in `infer_batch`.
         likelihood: as in `infer_batch`.
         horizon: as in `infer_batch`.
+        outliers: as in `infer_batch`.
         num_chains: as in `infer_batch`.
         num_warmup: as in `infer_batch`.
         num_samples: as in `infer_batch`.
@@ -138,7 +140,11 @@ def begin_sweep(
         raise ValueError(
             f"method: expected one of {', '.join(METHODS)}; got {method!r}"
         )
-    choose_likelihood(likelihood, horizon, method=method, outliers="none")
+    if outliers not in OUTLIERS:
+        raise ValueError(
+            f"outliers: expected one of {', '.join(OUTLIERS)}; got {outliers!r}"
+        )
+    choose_likelihood(likelihood, horizon, method=method, outliers=outliers)
     if batch < 1:
         raise ValueError(f"batch: expected at least 1, got {batch}")
     if isinstance(histories, History | str | os.PathLike):
@@ -156,6 +162,7 @@ def begin_sweep(
         "structure": None if structure is None else dict(structure),
         "likelihood": likelihood,
         "horizon": horizon,
+        "outliers": outliers,
         "num_chains": num_chains,
         "num_warmup": num_warmup,
         "num_samples": num_samples,
@@ -261,7 +268,9 @@ class Sweep:
         """
         path = self.folder / _MANIFEST
         now = json.loads(json.dumps(self.manifest()))
-        check_same(path, read_json(path, SCHEMA), now)
+        # Folders of before there was a choice do not name it.
+        begun = {"outliers": "none"} | read_json(path, SCHEMA)
+        check_same(path, begun, now)
 
     def check_untouched(self, units: Sequence[int]) -> None:
         """Make sure that none of these units is done.

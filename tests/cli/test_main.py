@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import boomdp_jax.inference
-from boomdp_jax.cli.main import LIKELIHOODS, METHODS, main
+from boomdp_jax.cli.main import LIKELIHOODS, METHODS, OUTLIERS, main
 from boomdp_jax.cli.output import numbered, without_non_finite
+from boomdp_jax.inference.infer import OUTLIERS as KNOWN_OUTLIERS
 
 SCENE = """{"schema": "planar-scene-1", "gravity": [0, 0], "dt": 0.02,
  "bodies": [{"name": "cart", "pose": [0, 0, 0],
@@ -46,6 +47,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("infer --scene scene.json", "required: DATA.npz"),
         ("infer data.npz --scene scene.json --method mcmc", "auto"),
         ("infer data.npz --scene scene.json --likelihood kalman", "open-loop"),
+        ("infer data.npz --scene scene.json --outliers gross", "student-t"),
+        (
+            "infer data.npz --scene scene.json --method nuts --outliers student-t",
+            "outliers: expected none with method 'nuts'",
+        ),
         (
             "infer data.npz --scene scene.json --horizon 0",
             "--horizon: expected",
@@ -156,6 +162,7 @@ def test_an_unknown_method_names_those_that_exist(
 def test_methods_are_those_of_the_library():
     assert METHODS == boomdp_jax.inference.METHODS
     assert LIKELIHOODS == boomdp_jax.inference.LIKELIHOODS
+    assert OUTLIERS == tuple(KNOWN_OUTLIERS)
 
 
 def test_help_is_status_0(capsys: pytest.CaptureFixture):

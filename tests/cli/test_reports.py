@@ -99,6 +99,7 @@ def test_infer_prints_one_json_line_a_recording_in_order(
         "horizon": None,
         "likelihood": "auto",
         "method": "rj",
+        "outliers": "none",
         "progress": True,
     }
     assert [json.loads(line) for line in output.out.splitlines()] == [

@@ -98,6 +98,7 @@ def test_other_settings_are_refused_and_named(
     capsys.readouterr()
     for change, message in (
         ("--seed 4", "out/sweep.json: seed: expected 0"),
+        ("--outliers student-t", 'out/sweep.json: outliers: expected "none"'),
         ("--method map", 'out/sweep.json: method: expected "auto"'),
         ("--rows 3", "out/sweep.json: num_rows: expected null"),
     ):

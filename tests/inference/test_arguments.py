@@ -1,12 +1,15 @@
 """What inference says to arguments that are none."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 
 from boomdp_jax.core import make_history
 from boomdp_jax.inference import infer, infer_batch
 from boomdp_jax.inference.arguments import check_arguments, check_history
+from boomdp_jax.inference.block import make_block
 from boomdp_jax.inference.infer import padded_histories
 from boomdp_jax.physics import scene_spec_from_dict
 
@@ -77,6 +80,20 @@ def test_counts_that_are_too_small_are_refused_at_once(method, count, message):
         infer(KEY, SPEC, history_of(2), method=method, **count)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("method", "num_each"), [("enumerate", 2), ("smc", 1)])
+def test_few_draws_are_returned_and_not_judged(method, num_each):
+    """Of `smc` two draws of four chains are spread over sixteen islands."""
+    posterior = infer(KEY, SPEC, history_of(0), method=method, num_samples=2)
+    diagnostics = posterior.to_json()["diagnostics"]
+    assert not diagnostics["ok"]
+    assert (
+        "box: too few draws to judge: expected at least 4 of each chain, got "
+        f"{num_each}" in diagnostics["reasons"]
+    )
+    assert diagnostics["r_hat"] is None
+
+
 def test_an_empty_table_has_room_for_a_row():
     (padded,) = padded_histories([history_of(0)])
     assert (padded.capacity, int(padded.num_transitions)) == (1, 0)
@@ -87,3 +104,22 @@ def test_an_empty_history_gives_the_prior():
         KEY, SPEC, history_of(0), method="map", likelihood="one-step", num_samples=50
     )
     assert np.isfinite(posterior.log_evidence)
+
+
+def test_a_block_of_no_rows_has_a_density():
+    target = make_block(SPEC, (0,), history_of(0)).target
+    first, z = jnp.asarray(0), jnp.zeros(target.dim)
+    expected = target.log_prior_density(first, z)
+    np.testing.assert_allclose(target.log_density(first, z), expected)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["svi", "nuts"])
+def test_an_empty_history_gives_the_prior_of_one_structure(method):
+    """Quantiles of the density, with the error of 300 independent draws."""
+    posterior = infer(KEY, SPEC, history_of(0), method=method, structure={})
+    density = np.asarray(posterior.params.density[:, 0])
+    slack = scipy.stats.norm.isf(1e-4) * np.sqrt(0.25 / 300)
+    for p in (0.1, 0.5, 0.9):
+        quantile = scipy.stats.lognorm(1.5, scale=30.0).ppf(p)
+        assert np.mean(density < quantile) == pytest.approx(p, abs=slack)

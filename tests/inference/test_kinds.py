@@ -13,6 +13,7 @@ from boomdp_jax.inference.kind_features import number_labels, outline_features
 from boomdp_jax.inference.kind_objects import resting_pose, sample_alone
 from boomdp_jax.inference.kind_problem import settle
 from boomdp_jax.inference.kind_state import Tallies
+from boomdp_jax.inference.kinds import _check_options
 from boomdp_jax.inference.kinds_file import LearntKinds
 from boomdp_jax.inference.structure_draws import SampleSettings
 from boomdp_jax.physics.body_spec import read_body
@@ -60,6 +61,9 @@ def test_bodies_with_other_constraints_are_refused_by_name():
         ({"sampler": "gibbs"}, "sampler: expected one of collapsed, sticks"),
         ({"concentration": 0.0}, "concentration: expected a positive number, or 0"),
         ({"prior": KindPrior(weights=(1.0,))}, "weights: expected 4 positive"),
+        ({"num_chains": 0}, "num_chains: expected at least 1, got 0"),
+        ({"num_warmup": -1}, "num_warmup: expected at least 0, got -1"),
+        ({"num_samples": 0}, "num_samples: expected at least 1, got 0"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(options, message):
@@ -68,12 +72,34 @@ def test_options_that_make_no_sense_are_refused(options, message):
         infer_kinds(jax.random.key(0), spec, nothing_seen(1), **options)
 
 
+@pytest.mark.parametrize(
+    ("option", "error", "message"),
+    [
+        (
+            {"prior_kinds": "k.npz"},
+            TypeError,
+            "prior_kinds: expected LearntKinds, .*got 'k.npz'",
+        ),
+        ({"prior": {}}, TypeError, "prior: expected a KindPrior; got {}"),
+        ({"concentration": "1"}, ValueError, "concentration: expected .*got '1'"),
+        ({"concentration": True}, ValueError, "concentration: expected .*got True"),
+    ],
+)
+def test_what_is_of_another_type_is_refused_by_name(option, error, message):
+    """Of the check itself, as tests run with types checked on every call."""
+    options = {"prior_kinds": None, "prior": None, "concentration": None} | option
+    with pytest.raises(error, match=message):
+        _check_options(sampler="collapsed", **options)
+
+
 def test_histories_of_other_scenes_are_refused():
     spec = scene([box("a")])
     with pytest.raises(ValueError, match="history: expected 1 bodies, got 2"):
         infer_kinds(jax.random.key(0), spec, nothing_seen(2))
     with pytest.raises(ValueError, match="histories: expected one per scene, 2, got 1"):
         infer_kinds(jax.random.key(0), [spec, spec], nothing_seen(1))
+    with pytest.raises(ValueError, match="specs: expected at least one, got none"):
+        infer_kinds(jax.random.key(0), [], [])
 
 
 def test_outlines_are_told_apart_whatever_their_pose():

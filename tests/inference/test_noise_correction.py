@@ -123,3 +123,9 @@ def test_likeness_is_the_largest_correlation_of_any_number_within_groups():
     after[:2000, 1] = 0.6 * before[:2000, 1] / 20.0 + 0.8 * after[:2000, 1]
     found = noise_correction._likeness(before, after, group)
     assert found == pytest.approx(0.6, abs=0.06)
+
+
+def test_a_single_draw_reaches_nowhere(recwarn):
+    point = np.zeros((1, 3))
+    assert noise_correction._reach(point, point + 1.0) == 0.0
+    assert not recwarn.list

@@ -20,6 +20,7 @@ from boomdp_jax.inference.fixed_structure import (
     scene_layout,
     structure_blocks,
 )
+from boomdp_jax.inference.model_sites import coordinate_names
 from boomdp_jax.inference.numpyro_model import make_model
 from boomdp_jax.inference.one_step import OneStepLikelihood
 from boomdp_jax.physics import empty_params, rollout, scene_spec_from_dict
@@ -53,6 +54,20 @@ def pushed(spec, num_rows=20, seed=0):
     noise = np.array([1e-3, 1e-3, 1e-3, 5e-3, 5e-3, 5e-3])
     reading = truth[1:] + noise * rng.normal(size=truth[1:].shape)
     return make_history(truth[:-1], wrench, reading, 0.02)
+
+
+def test_coordinates_have_the_names_of_their_sites():
+    unknown = dict.fromkeys(("revolute", "wheel", "weld", "prismatic"), 1)
+    unknown |= {"center_of_mass": True, "actuator": ["gain", "bias"]}
+    spec = make_spec(unknown=unknown)
+    structure = {"table": ["revolute", "wheel"]}
+    model = make_model(spec, pushed(make_spec()), structure)
+    names = coordinate_names(("table",), model.blocks[0].layout)
+    assert sum(len(site.coordinates) for site in model.sites[0]) == len(names)
+    for site in model.sites[0]:
+        for place, coordinate in enumerate(site.coordinates):
+            ending = f"[{place}]" if len(site.coordinates) > 1 else ""
+            assert names[coordinate] == site.name + ending
 
 
 @pytest.fixture(scope="module")

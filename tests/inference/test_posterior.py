@@ -57,6 +57,16 @@ def test_the_report_is_json_without_nan(precision):
     assert posterior.params.density.dtype == jnp.dtype(f"float{precision.bits}")
 
 
+def test_the_summary_says_what_the_numbers_of_the_noise_are():
+    """A Student-t of 4 degrees of freedom has the square root of two scales as sd."""
+    assert "noise of one reading (sd)" in table_posterior(80).summary()
+    robust = {"ok": True, "reasons": [], "degrees_of_freedom": 4.0}
+    lines = table_posterior(80, diagnostics=robust).summary().splitlines()
+    (line,) = [line for line in lines if line.startswith("noise of one reading")]
+    assert "scale of Student-t noise of 4 degrees of freedom" in line
+    assert "sd is 1.41 times that" in line
+
+
 def test_mass_is_density_times_area():
     posterior = table_posterior(400)
     body = posterior.to_json()["bodies"]["table"]

@@ -186,6 +186,16 @@ def test_another_seed_or_version_is_refused(
         begin(tmp_path)
 
 
+def test_a_folder_of_before_outliers_had_a_choice_goes_on(tmp_path: Path):
+    begin(tmp_path)
+    manifest = json.loads((tmp_path / "sweep.json").read_text())
+    assert manifest.pop("outliers") == "none"
+    (tmp_path / "sweep.json").write_text(json.dumps(manifest))
+    begin(tmp_path)
+    with pytest.raises(ValueError, match=r'outliers: expected "none", .*"student-t"'):
+        begin(tmp_path, outliers="student-t")
+
+
 def test_another_recording_is_refused_and_named(tmp_path: Path, cheap: list):
     files = []
     for number, history in enumerate(recordings(2)):
@@ -218,6 +228,7 @@ def test_a_shard_that_does_not_exist_is_refused(tmp_path: Path, shard):
     ("changes", "message"),
     [
         ({"method": "guess"}, "method: expected one of auto"),
+        ({"outliers": "gross"}, "outliers: expected one of none, student-t; got"),
         ({"batch": 0}, "batch: expected at least 1, got 0"),
         ({"histories": []}, "histories: expected at least one, got none"),
     ],
