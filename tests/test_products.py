@@ -20,6 +20,7 @@ from boomdp_jax.inference.noise import draw_noise
 from boomdp_jax.inference.numpyro_model import make_model
 from boomdp_jax.inference.one_step import OneStepLikelihood
 from boomdp_jax.inference.prior import NOISE_GROUPS
+from boomdp_jax.inference.reading_law import ReadingLaw, law_after, log_likelihood
 from boomdp_jax.inference.seeds import seed_coordinates
 from boomdp_jax.inference.slot_conditional import sample_slot, slot_log_density
 from boomdp_jax.inference.track_data import track_data
@@ -124,6 +125,17 @@ def test_products_of_likelihoods_and_first_guesses_have_all_bits():
     z, active = jnp.zeros(block.layout.dim), block.target.structures[-1]
     assert not products(jax.value_and_grad(lambda z: single(z, active)), z)
     check(seed_coordinates, tracked.coordinates, tracked.data.steps)
+
+
+def test_products_of_expected_readings_have_all_bits():
+    spec = small_world()
+    params = jax.tree.map(lambda leaf: leaf[None], spec.params())
+    noise, wrench = jnp.ones((1, 3, 4)), jnp.zeros((3, 3))
+    arguments = noise, noise[..., :2], spec.initial_state(), wrench, jnp.ones((2, 3, 3))
+    after = functools.partial(law_after, spec.scene, params, bodies=(0, 1))
+    assert not products(after, *arguments)
+    law = ReadingLaw(jnp.zeros((1, 6)), jnp.eye(6)[None], jnp.ones((1, 6)), None)
+    check(log_likelihood, law, jnp.zeros((1, 6)))
 
 
 def test_products_of_mixtures_and_moves_have_all_bits():

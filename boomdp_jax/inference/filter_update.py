@@ -70,6 +70,16 @@ def move_and_correct(
     return _arrays(*one_loop(_move_and_correct, *_scalars(*arrays)))
 
 
+def move(
+    covariance: Float[Array, "channel channel"],
+    rise: Float[Array, "start channel"],
+    scale: Float[Array, " channel"],
+    kick: Float[Array, " channel"],
+) -> Float[Array, "channel channel"]:
+    """Move a covariance through a step; arguments as for `move_and_correct`."""
+    return in_lanes(_move_in_lanes, covariance, rise, scale, kick)
+
+
 def start_and_correct_channels(is_start, at_start, lower, miss, mask, variance):
     """As `correct`, of scalars; a track that starts here forgets what was before.
 
@@ -168,14 +178,18 @@ def _dot(left, right):
 
 
 def _move_and_correct_in_lanes(covariance, rise, scale, kick, miss, mask, variance):
-    num = range(miss.shape[0])
+    moved = _move_in_lanes(covariance, rise, scale, kick)
+    return _correct_in_lanes(moved, miss, mask, variance)
+
+
+def _move_in_lanes(covariance, rise, scale, kick):
+    num = range(scale.shape[0])
     # By start channel: rows of `slope` are columns of the derivative.
     slope = rise * (1.0 / scale)[:, None]
     half = sum(slope[k][:, None] * covariance[k][None] for k in num)
     moved = sum(half[:, k][:, None] * slope[k][None] for k in num)
     shaken = slope * kick[:, None]
-    moved = moved + sum(shaken[k][:, None] * slope[k][None] for k in num)
-    return _correct_in_lanes(moved, miss, mask, variance)
+    return moved + sum(shaken[k][:, None] * slope[k][None] for k in num)
 
 
 def _correct_in_lanes(covariance, miss, mask, variance):

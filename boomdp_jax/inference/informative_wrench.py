@@ -12,7 +12,15 @@ experiments, eq. 9. Of that, what y tells of the structure alone is
 $E[\log p(y \mid k, u) - \log p(y \mid u)]$, with $p(y \mid k, u)$ the mean over the
 draws of structure k. Noise is the same for every wrench, so that gains compare well.
 
-It costs one simulation per draw and wrench, and the likelihood of every pair of draws.
+Readings err as the posterior says they do, normally or by Student's t, and the motion
+has the noise of its own that was inferred: what impulses drown, no push tells
+(`reading_law`, which linearises their effect).
+
+It costs one simulation per draw and wrench, and the likelihood of every pair of draws;
+where the motion has noise, six simulations more for each body that moves. With it
+Student-t readings cost a quadrature for every pair of draws and channel: 40 wrenches of
+a lone body, 256 draws and five steps take 4 s on two cores, where normal ones take
+0.16 s and motion without noise 0.03 s. Fewer draws pay there, by their square.
 """
 
 from typing import NamedTuple
@@ -22,19 +30,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import logsumexp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.core.checked_input import real_array, whole_number
 from boomdp_jax.inference.posterior import Posterior
-from boomdp_jax.physics import step
+from boomdp_jax.inference.reading_law import (
+    draw_noise,
+    law_after,
+    log_likelihood,
+    readings_of,
+)
+from boomdp_jax.physics.actuator import delayed, past_commands
 from boomdp_jax.physics.arguments import check_state_is_finite, checked_state
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
-
-# Noise group of x, y, theta, xdot, ydot, thetadot.
-_GROUP = (0, 0, 1, 2, 2, 3)
 
 
 class InformationGain(NamedTuple):
@@ -66,8 +77,11 @@ def informative_wrench(
     Args:
         key: random key.
         posterior: what is known.
-        state: where the bodies are.
-        candidates: wrenches at the centres of mass `[candidate, body, 3]` [N, N m].
+        state: where the bodies are, taken as exact.
+        candidates: wrenches commanded at the centres of mass, world frame
+            `[candidate, body, 3]` [N, N, N m]. What acts has each draw's gain and bias
+            of the actuator and sets in with its delay, before which nothing was
+            commanded: of a delay longer than the steps nothing can be learnt.
         num_steps: steps of the scene over which a wrench is held before the reading.
         num_draws: posterior draws that are compared; gains above their logarithm
             cannot be told apart.
@@ -97,15 +111,20 @@ def informative_wrench(
     check_state_is_finite(state, posterior.spec.names)
     thinned = posterior.thin(num_draws)
     scene = posterior.spec.scene
+    freedom = posterior.degrees_of_freedom
+    bodies = np.flatnonzero(~np.asarray(scene.is_static))
     gain, structure_gain, error = _gains(
         key,
         scene,
         posterior.spec.with_surface(thinned.params),
         thinned.noise_scale,
+        _impulse_scale(thinned, bodies),
         jnp.asarray(_structures(thinned)),
         state,
         jnp.asarray(wrenches, thinned.noise_scale.dtype),
-        num_steps,
+        _shares_in_effect(thinned, num_steps),
+        tuple(bodies.tolist()),
+        None if freedom is None else float(freedom),
     )
     best = int(np.argmax(np.asarray(gain)))
     return InformationGain(
@@ -124,55 +143,65 @@ def _structures(posterior: Posterior) -> np.ndarray:
     return np.unique(rows, axis=0, return_inverse=True)[1].reshape(num)
 
 
+def _impulse_scale(posterior: Posterior, bodies: np.ndarray) -> Array | None:
+    """Noise of the motion, None where no body that moves has any."""
+    scale = posterior.impulse_scale
+    is_there = scale is not None and np.any(np.asarray(scale)[:, bodies] > 0)
+    return scale if is_there else None
+
+
+def _shares_in_effect(
+    posterior: Posterior, num_steps: int
+) -> Float[Array, "*draw time body 3"]:
+    """Which share of a command is in effect in each step, from its first on."""
+    params, dtype = posterior.params, posterior.noise_scale.dtype
+    all_the_time = np.ones((num_steps, posterior.spec.num_bodies, 3), dtype)
+    if params.actuator is None or params.actuator.delay is None:
+        return jnp.asarray(all_the_time)
+    lengths = np.full(num_steps, np.asarray(posterior.spec.scene.dt), dtype)
+    commands = past_commands(all_the_time, lengths, np.arange(num_steps) == 0)
+    return jax.vmap(lambda one: delayed(one, commands))(params)
+
+
 @eqx.filter_jit
 def _gains(
     key: Key,
     scene: Scene,
     params: Params,
     noise_scale: Float[Array, "draw body 4"],
+    impulse_scale: Float[Array, "draw body 2"] | None,
     structure: Int[Array, " draw"],
     state: State,
     candidates: Float[Array, "candidate body 3"],
-    num_steps: int,
+    share: Float[Array, "*draw time body 3"],
+    bodies: tuple[int, ...],
+    freedom: float | None,
 ) -> tuple[Array, Array, Array]:
     """Gain, that of the structure, and standard error of every candidate."""
-    scale = noise_scale[..., jnp.asarray(_GROUP)]
-    moves = jnp.broadcast_to(~scene.is_static[:, None], scale.shape[1:])
-    noise = scale * jax.random.normal(key, scale.shape, scale.dtype)
+    num = noise_scale.shape[0]
+    noise = draw_noise(key, num, scene.num_bodies, freedom, noise_scale.dtype)
+    noise = jax.tree.map(lambda leaf: leaf[:, np.asarray(bodies, int)], noise)
     same = structure[:, None] == structure[None]
 
-    def predict(params: Params, wrench: Array) -> Array:
-        def advance(state: State, _: None) -> tuple[State, None]:
-            return step(scene, params, state, wrench)[0], None
-
-        return jax.lax.scan(advance, state, None, length=num_steps)[0].array
-
     def one(wrench: Array) -> tuple[Array, Array, Array]:
-        mean = jax.vmap(lambda params: predict(params, wrench))(params)
-        log_likelihood = _log_likelihood(mean + noise, mean, scale, moves)
-        own = jnp.diagonal(log_likelihood)
-        num = own.shape[0]
-        whole = logsumexp(log_likelihood, axis=1) - jnp.log(num)
-        within = logsumexp(jnp.where(same, log_likelihood, -jnp.inf), axis=1)
+        law = law_after(
+            scene,
+            params,
+            noise_scale,
+            impulse_scale,
+            state,
+            wrench,
+            share,
+            bodies=bodies,
+            freedom=freedom,
+        )
+        density = log_likelihood(law, readings_of(law, noise))
+        own = jnp.diagonal(density)
+        whole = logsumexp(density, axis=1) - jnp.log(num)
+        within = logsumexp(jnp.where(same, density, -jnp.inf), axis=1)
         within = within - jnp.log(jnp.sum(same, axis=1))
         each = own - whole
         error = jnp.std(each) / jnp.sqrt(num)
         return jnp.mean(each), jnp.mean(within - whole), error
 
     return jax.lax.map(one, candidates)
-
-
-def _log_likelihood(
-    reading: Float[Array, "draw body 6"],
-    mean: Float[Array, "draw body 6"],
-    scale: Float[Array, "draw body 6"],
-    moves: Bool[Array, "body 6"],
-) -> Float[Array, "draw draw"]:
-    """Of every reading (rows) under every draw (columns), up to a constant."""
-
-    def pair(reading: Array, mean: Array, scale: Array) -> Array:
-        each = -0.5 * ((reading - mean) / scale) ** 2 - jnp.log(scale)
-        return jnp.sum(jnp.where(moves, each, 0.0))
-
-    over_draws = jax.vmap(pair, (None, 0, 0))
-    return jax.lax.map(lambda r: over_draws(r, mean, scale), reading)

@@ -1,26 +1,51 @@
 """Expected information against the mutual information of two known hypotheses."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import integrate, stats
+from scipy import integrate, signal, stats
 
 from boomdp_jax.inference.informative_wrench import informative_wrench
-from boomdp_jax.physics import State, empty_params
-from tests.inference.posteriors import draws_like, make_posterior, table_spec
-from tests.inference.recordings import AREA, DT
+from boomdp_jax.inference.random_motion import add_impulse
+from boomdp_jax.inference.reading_law import law_after
+from boomdp_jax.physics import State, empty_params, step
+from boomdp_jax.physics.params import Actuator
+from tests.inference.posteriors import (
+    draws_like,
+    make_posterior,
+    table_posterior,
+    table_spec,
+)
+from tests.inference.recordings import AREA, DT, response, transition_matrix
 
 NUM_DRAWS = 1000
 NOISE = 1e-3
 
 
-def two_boxes(densities=(10.0, 20.0)):
+def two_boxes(densities=(10.0, 20.0), *, noise=(NOISE,) * 4, impulse=None, **fields):
     """A posterior of two equally likely densities and nothing else open."""
     spec = table_spec()
     density = np.repeat(densities, NUM_DRAWS // 2)[:, None]
     params = draws_like(empty_params(1), NUM_DRAWS, density=jnp.asarray(density))
-    return make_posterior(spec, params, params, noise_scale=(NOISE,) * 4)
+    if impulse is not None:
+        fields["impulse_scale"] = jnp.tile(jnp.asarray(impulse), (NUM_DRAWS, 1, 1))
+    return make_posterior(spec, params, params, noise_scale=noise, **fields)
+
+
+def two_delays(delays, gain):
+    """A box of 10 kg/m² that a known force acts on, and commands after one of two."""
+    params = draws_like(empty_params(1, density=10.0), NUM_DRAWS)
+    actuator = Actuator(
+        gain=jnp.full((NUM_DRAWS, 1), gain),
+        bias=jnp.tile(jnp.array([0.7, -0.2, 0.1]), (NUM_DRAWS, 1, 1)),
+        delay=jnp.repeat(jnp.asarray(delays), NUM_DRAWS // 2)[:, None],
+    )
+    params = eqx.tree_at(
+        lambda p: p.actuator, params, actuator, is_leaf=lambda leaf: leaf is None
+    )
+    return make_posterior(table_spec(), params, params, noise_scale=(NOISE,) * 4)
 
 
 def two_structures():
@@ -95,6 +120,121 @@ def test_a_push_across_a_wheel_tells_whether_there_is_one():
     assert found.structure_gain[1] == pytest.approx(np.log(2.0), abs=1e-3)
     assert found.structure_gain[0] < 0.01
     np.testing.assert_allclose(found.gain, found.structure_gain, atol=1e-9)
+
+
+def test_a_push_that_impulses_drown_tells_nothing():
+    noise, impulse, num_steps = (1e-3, 1e-3, 0.05, 1e-3), (0.01, 0.5), 5
+    posterior = two_boxes(noise=noise, impulse=impulse)
+    wrenches = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 0.0, 0.3]])
+    found = informative_wrench(
+        jax.random.key(0),
+        posterior,
+        posterior.spec.initial_state(),
+        wrenches[:, None],
+        num_steps=num_steps,
+        num_draws=NUM_DRAWS,
+    )
+    # A free box is linear: a kick changes the twist at once, whatever the mass.
+    move, kick = transition_matrix(), np.array(impulse)[[0, 0, 1]]
+    covariance, gap = np.zeros((6, 6)), np.zeros((3, 6))
+    for _ in range(num_steps):
+        covariance[3:, 3:] += np.diag(kick**2)
+        covariance = move @ covariance @ move.T
+        push = response(10.0 * AREA) - response(20.0 * AREA)
+        gap = gap @ move.T + wrenches @ push.T
+    covariance += np.diag(np.array(noise)[[0, 0, 1, 2, 2, 3]] ** 2)
+    square = np.sum(gap * np.linalg.solve(covariance, gap.T).T, axis=1)
+    expected = np.array([mutual_information(d) for d in np.sqrt(square)])
+    assert expected[1] > 0.1 > 0.01 > expected[2]
+    assert found.best == 1
+    gaps = np.abs(np.asarray(found.gain) - expected)
+    assert np.all(gaps < 4.0 * np.asarray(found.error) + 0.01)
+
+
+@pytest.mark.slow
+def test_noise_of_the_motion_of_a_pinned_table_is_that_of_many_motions():
+    posterior = table_posterior(2)
+    scene, state = posterior.spec.scene, State(jnp.zeros((1, 3)), jnp.zeros((1, 3)))
+    params = jax.tree.map(lambda leaf: leaf[:1], posterior.params)
+    wrench, impulse = jnp.array([[3.0, 5.0, 1.0]]), jnp.array([[0.02, 0.04]])
+    noise, share = posterior.noise_scale[:1], jnp.ones((4, 1, 3))
+    law = law_after(
+        scene, params, noise, impulse[None], state, wrench, share, bodies=(0,)
+    )
+    one = jax.tree.map(lambda leaf: leaf[0], params)
+
+    def moved(key):
+        def advance(state, key):
+            state = add_impulse(key, state, impulse, scene.is_static)
+            return step(scene, one, state, wrench)[0], None
+
+        return jax.lax.scan(advance, state, jax.random.split(key, 4))[0].array[0]
+
+    states = jax.jit(jax.vmap(moved))(jax.random.split(jax.random.key(0), 20_000))
+    covariance = np.cov(np.asarray(states).T)
+    sd = np.sqrt(np.diag(covariance))
+    assert np.all(sd > 5e-5)
+    drift = np.asarray(law.mean[0]) - np.mean(states, axis=0)
+    assert np.all(np.abs(drift) < 0.05 * sd)
+    error = (np.asarray(law.covariance[0]) - covariance) / np.outer(sd, sd)
+    assert np.abs(error).max() < 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("impulse", [None, (2.0 * NOISE, 0.0)])
+def test_readings_with_outliers_tell_as_much_as_theory_says(impulse):
+    posterior = two_boxes(
+        noise=(1e3, 1e3, NOISE, 1e3),
+        impulse=impulse,
+        diagnostics={"ok": True, "reasons": [], "degrees_of_freedom": 4.0},
+    )
+    force = 0.6
+    found = informative_wrench(
+        jax.random.key(0),
+        posterior,
+        posterior.spec.initial_state(),
+        np.array([[[force, 0.0, 0.0]]]),
+        num_draws=NUM_DRAWS,
+    )
+    # In units of the noise; of a velocity, since nothing else is read well.
+    width = 0.005
+    y = width * np.arange(-40_000, 40_001)
+    density = stats.t.pdf(y, 4.0)
+    if impulse is not None:
+        near = width * np.arange(-4000, 4001)
+        blur = width * stats.norm.pdf(near, scale=impulse[0] / NOISE)
+        density = signal.fftconvolve(density, blur, mode="same")
+    gap = force * DT * (1.0 / (10.0 * AREA) - 1.0 / (20.0 * AREA)) / NOISE
+    shifted = np.interp(y - gap, y, density)
+    expected = np.log(2.0) - width * np.sum(density * np.log1p(shifted / density))
+    assert expected > 0.05
+    error = 4.0 * float(found.error[0]) + 0.005
+    assert float(found.gain[0]) == pytest.approx(expected, abs=error)
+
+
+@pytest.mark.slow
+def test_commands_take_effect_late_and_tell_of_the_delay():
+    delays, gain, num_steps = np.array([0.02, 0.06]), 2.0, 5
+    posterior = two_delays(delays, gain)
+    force = np.array([0.0, 0.02, 5.0])
+    candidates = np.zeros((3, 1, 3))
+    candidates[:, 0, 0] = force
+    found = informative_wrench(
+        jax.random.key(0),
+        posterior,
+        posterior.spec.initial_state(),
+        candidates,
+        num_steps=num_steps,
+        num_draws=NUM_DRAWS,
+    )
+    acting = num_steps * DT - delays
+    per_force = gain * np.array([np.diff(0.5 * acting**2), np.diff(acting)])
+    distance = force * np.hypot(*per_force[:, 0]) / (10.0 * AREA * NOISE)
+    expected = [mutual_information(d) for d in distance]
+    assert 0.02 < expected[1] < 0.5 < expected[2]
+    assert found.best == 2
+    gaps = np.abs(np.asarray(found.gain) - expected)
+    assert np.all(gaps < 4.0 * np.asarray(found.error) + 0.01)
 
 
 @pytest.mark.parametrize(
