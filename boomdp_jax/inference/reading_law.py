@@ -137,6 +137,10 @@ def law_after(
     none = None if kick is None else jnp.zeros((*kick.shape, kick.shape[1]), kick.dtype)
     shares = share if share.ndim == 3 else jnp.moveaxis(share, 1, 0)
     (mean, covariance), _ = jax.lax.scan(one_step, (start, none), shares)
+    if covariance is not None:
+        # What products are rounded by is noise, too.
+        variance = jnp.diagonal(covariance, axis1=1, axis2=2)
+        scale = jnp.sqrt(scale**2 + _slack(scale) * variance)
     return ReadingLaw(mean, covariance, scale, freedom)
 
 
@@ -225,11 +229,14 @@ def _factor(covariance: Float[Array, "draw channel channel"]) -> Array:
     sd = jnp.sqrt(jnp.diagonal(covariance, axis1=1, axis2=2))
     unit = jnp.where(sd > 0, sd, 1.0)
     correlation = covariance / (unit[:, :, None] * unit[:, None])
-    # More than products are rounded by; no noise is known so well.
-    num = sd.shape[-1]
-    slack = 10.0 * num * jnp.finfo(sd.dtype).eps
-    factor = jnp.linalg.cholesky(correlation + slack * jnp.eye(num)[None])
+    slack = _slack(sd) * jnp.eye(sd.shape[-1])
+    factor = jnp.linalg.cholesky(correlation + slack[None])
     return sd[:, :, None] * factor
+
+
+def _slack(channels: Float[Array, "draw channel"]) -> float:
+    """Share of a variance that is more than its rounding."""
+    return channels.shape[-1] * float(jnp.finfo(channels.dtype).eps)
 
 
 def _times(factor: Array, vector: Array) -> Array:
