@@ -25,7 +25,6 @@ from boomdp_jax.inference.posterior_file import (
 )
 from boomdp_jax.inference.posterior_report import (
     SCHEMA,
-    format_report,
     report_bodies,
     report_known,
     report_noise,
@@ -33,6 +32,7 @@ from boomdp_jax.inference.posterior_report import (
     structure_probabilities,
 )
 from boomdp_jax.inference.random_motion import add_impulse, add_reading_noise
+from boomdp_jax.inference.report_table import format_report
 from boomdp_jax.inference.summary import plain
 from boomdp_jax.physics import step
 from boomdp_jax.physics.arguments import checked_state, checked_wrench

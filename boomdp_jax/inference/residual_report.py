@@ -3,7 +3,7 @@
 import math
 
 from boomdp_jax.inference.evidence_report import BlockResult
-from boomdp_jax.inference.posterior_report import plus_minus
+from boomdp_jax.inference.report_table import plus_minus
 from boomdp_jax.inference.residual import BodyLaw
 from boomdp_jax.inference.residual_laws import LAWS
 from boomdp_jax.physics.scene_spec import SceneSpec
