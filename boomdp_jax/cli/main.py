@@ -83,8 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments = _make_parser().parse_args(argv)
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 2
-    keep_programs = importlib.import_module("boomdp_jax.core").keep_programs
-    keep_programs()
+    importlib.import_module("boomdp_jax.core").keep_programs()
     command = importlib.import_module(f"boomdp_jax.cli.{arguments.command}")
     with warnings.catch_warnings():
         warnings.simplefilter("default")

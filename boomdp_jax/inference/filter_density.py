@@ -14,6 +14,7 @@ from boomdp_jax.core.arrays import FloatScalar
 from boomdp_jax.inference.contact_prediction import ContactScene
 from boomdp_jax.inference.filter_update import (
     correct,
+    move,
     move_and_correct,
     move_and_correct_channels,
     start_and_correct_channels,
@@ -25,7 +26,7 @@ from boomdp_jax.inference.kalman import (
     start_factor,
     start_scale,
 )
-from boomdp_jax.inference.robust_update import correct_robustly, move
+from boomdp_jax.inference.robust_update import correct_robustly
 from boomdp_jax.inference.track_data import TrackData, TrackRow, with_delay
 from boomdp_jax.inference.tracking import (
     Predict,

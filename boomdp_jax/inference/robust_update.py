@@ -23,7 +23,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar
-from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.core.lanes import in_lanes
 
 DEGREES_OF_FREEDOM = 4.0
@@ -80,19 +79,6 @@ def correct_robustly(
     """
     arrays = (covariance, miss, mask, variance)
     return RobustUpdate(*in_lanes(_correct, *arrays, static=(freedom,)))
-
-
-@full_precision
-def move(
-    covariance: Float[Array, "channel channel"],
-    rise: Float[Array, "start channel"],
-    scale: Float[Array, " channel"],
-    kick: Float[Array, " channel"],
-) -> Float[Array, "channel channel"]:
-    """Move a covariance through a step; arguments as for `move_and_correct`."""
-    slope = (rise / scale[:, None]).T
-    moved = slope @ (covariance + jnp.diag(kick)) @ slope.T
-    return 0.5 * (moved + moved.T)
 
 
 def _correct(freedom: float, covariance, miss, mask, variance) -> tuple:

@@ -27,17 +27,21 @@ print(json.dumps([str(folder), len(hits)]))
 """
 
 
-def compile_something(cache: pathlib.Path, *arguments: str, **more: str):
-    """Folder and programs that were read from it, by a process of its own."""
-    environment = {
+def environment(cache: pathlib.Path, **more: str) -> dict[str, str]:
+    """Of a process whom nobody told where to keep programs."""
+    mine = {
         name: value
         for name, value in os.environ.items()
         if not name.startswith(("JAX_COMPILATION_CACHE", "JAX_PERSISTENT_CACHE"))
     }
-    environment |= {"XDG_CACHE_HOME": str(cache)} | more
+    return mine | {"XDG_CACHE_HOME": str(cache)} | more
+
+
+def compile_something(cache: pathlib.Path, *arguments: str, **more: str):
+    """Folder and programs that were read from it, by a process of its own."""
     done = subprocess.run(
         [sys.executable, "-c", _COMPILES, *arguments],
-        env=environment,
+        env=environment(cache, **more),
         check=True,
         capture_output=True,
         text=True,
@@ -96,13 +100,7 @@ def test_the_command_line_keeps_what_it_compiles(tmp_path):
         '{"schema": "planar-scene-1", "dt": 0.02, "bodies": [{"name": "box", '
         '"shape": {"type": "box", "half_extents": [0.2, 0.1]}, "density": 10}]}'
     )
-    environment = {
-        name: value
-        for name, value in os.environ.items()
-        if not name.startswith("JAX_COMPILATION_CACHE")
-    }
     command = [sys.executable, "-m", "boomdp_jax", "simulate", str(scene)]
     command += ["--actions", "missing.npz", "--out", str(tmp_path / "out.npz")]
-    environment |= {"XDG_CACHE_HOME": str(tmp_path)}
-    subprocess.run(command, env=environment, capture_output=True, check=False)
+    subprocess.run(command, env=environment(tmp_path), capture_output=True, check=False)
     assert (tmp_path / "boomdp_jax" / "programs").is_dir()

@@ -65,6 +65,15 @@ def two_structures():
     return make_posterior(spec, params, params, noise_scale=(NOISE,) * 4)
 
 
+def told(posterior, candidates, *, seed=0, **options):
+    """What candidates tell from the scene's own start on, by all draws."""
+    state = posterior.spec.initial_state()
+    options = {"num_draws": NUM_DRAWS} | options
+    return informative_wrench(
+        jax.random.key(seed), posterior, state, candidates, **options
+    )
+
+
 def mutual_information(distance: float) -> float:
     """Of which of two unit normals so far apart a number is drawn from [nats]."""
 
@@ -80,13 +89,7 @@ def test_two_densities_are_told_apart_as_theory_says():
     force = np.array([0.0, 0.15, 0.3, 0.6, 5.0])
     candidates = np.zeros((len(force), 1, 3))
     candidates[:, 0, 0] = force
-    found = informative_wrench(
-        jax.random.key(0),
-        posterior,
-        posterior.spec.initial_state(),
-        jnp.asarray(candidates),
-        num_draws=NUM_DRAWS,
-    )
+    found = told(posterior, jnp.asarray(candidates))
     mass = np.array([10.0, 20.0]) * AREA
     # A force held over a step moves a free body by F dt²/2m and speeds it by F dt/m.
     gap = force * abs(1.0 / mass[0] - 1.0 / mass[1])
@@ -107,14 +110,7 @@ def test_two_densities_are_told_apart_as_theory_says():
 def test_a_push_across_a_wheel_tells_whether_there_is_one():
     posterior = two_structures()
     candidates = jnp.asarray([[[5.0, 0.0, 0.0]], [[0.0, 5.0, 0.0]]])
-    found = informative_wrench(
-        jax.random.key(1),
-        posterior,
-        posterior.spec.initial_state(),
-        candidates,
-        num_draws=NUM_DRAWS,
-        num_steps=3,
-    )
+    found = told(posterior, candidates, num_steps=3, seed=1)
     assert found.best == 1
     np.testing.assert_array_equal(found.wrench, candidates[1])
     assert found.structure_gain[1] == pytest.approx(np.log(2.0), abs=1e-3)
@@ -126,14 +122,7 @@ def test_a_push_that_impulses_drown_tells_nothing():
     noise, impulse, num_steps = (1e-3, 1e-3, 0.05, 1e-3), (0.01, 0.5), 5
     posterior = two_boxes(noise=noise, impulse=impulse)
     wrenches = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 0.0, 0.3]])
-    found = informative_wrench(
-        jax.random.key(0),
-        posterior,
-        posterior.spec.initial_state(),
-        wrenches[:, None],
-        num_steps=num_steps,
-        num_draws=NUM_DRAWS,
-    )
+    found = told(posterior, wrenches[:, None], num_steps=num_steps)
     # A free box is linear: a kick changes the twist at once, whatever the mass.
     move, kick = transition_matrix(), np.array(impulse)[[0, 0, 1]]
     covariance, gap = np.zeros((6, 6)), np.zeros((3, 6))
@@ -189,13 +178,7 @@ def test_readings_with_outliers_tell_as_much_as_theory_says(impulse):
         diagnostics={"ok": True, "reasons": [], "degrees_of_freedom": 4.0},
     )
     force = 0.6
-    found = informative_wrench(
-        jax.random.key(0),
-        posterior,
-        posterior.spec.initial_state(),
-        np.array([[[force, 0.0, 0.0]]]),
-        num_draws=NUM_DRAWS,
-    )
+    found = told(posterior, np.array([[[force, 0.0, 0.0]]]))
     # In units of the noise; of a velocity, since nothing else is read well.
     width = 0.005
     y = width * np.arange(-40_000, 40_001)
@@ -219,14 +202,7 @@ def test_commands_take_effect_late_and_tell_of_the_delay():
     force = np.array([0.0, 0.02, 5.0])
     candidates = np.zeros((3, 1, 3))
     candidates[:, 0, 0] = force
-    found = informative_wrench(
-        jax.random.key(0),
-        posterior,
-        posterior.spec.initial_state(),
-        candidates,
-        num_steps=num_steps,
-        num_draws=NUM_DRAWS,
-    )
+    found = told(posterior, candidates, num_steps=num_steps)
     acting = num_steps * DT - delays
     per_force = gain * np.array([np.diff(0.5 * acting**2), np.diff(acting)])
     distance = force * np.hypot(*per_force[:, 0]) / (10.0 * AREA * NOISE)
