@@ -47,6 +47,9 @@ class Subject(NamedTuple):
     num_particles: int
     num_samples: int
     """Most rows of one that is taught beforehand."""
+    num_regressed: int = 1000
+    """Newest rows that a linear or a locally weighted regression keeps while it acts;
+    as many as in the successor paper."""
 
 
 class Recipe(NamedTuple):
@@ -110,6 +113,14 @@ def _regression(
     return build
 
 
+def _linear(subject: Subject) -> LinearRegression:
+    return LinearRegression(capacity=subject.num_regressed)
+
+
+def _local(subject: Subject) -> LocallyWeighted:
+    return LocallyWeighted(capacity=subject.num_regressed)
+
+
 def _object_oriented(subject: Subject) -> AbstractModel:
     scene, surroundings = subject.surroundings
     return ObjectOriented(
@@ -149,10 +160,10 @@ RECIPES: Mapping[str, Recipe] = MappingProxyType(
         "physics-residual": Recipe(_residual, _NUM_HYPOTHESES, is_restless=True),
         "point-fit": _one_law(_point_fit(GaussNewton)),
         "cma-es": _one_law(_point_fit(CmaEs)),
-        "lr": _one_law(_regression(lambda _: LinearRegression(), "world")),
-        "lr-body": _one_law(_regression(lambda _: LinearRegression(), "body")),
-        "lwr": _one_law(_regression(lambda _: LocallyWeighted(), "body")),
-        "lwr-world": _one_law(_regression(lambda _: LocallyWeighted(), "world")),
+        "lr": _one_law(_regression(_linear, "world")),
+        "lr-body": _one_law(_regression(_linear, "body")),
+        "lwr": _one_law(_regression(_local, "body")),
+        "lwr-world": _one_law(_regression(_local, "world")),
         "lwr-pretrained": Recipe(
             _regression(
                 lambda subject: LocallyWeighted(capacity=subject.num_samples), "body"

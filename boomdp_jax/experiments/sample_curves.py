@@ -48,9 +48,10 @@ def sample_errors(
 ) -> Iterator[SampleErrors]:
     """Tell a learner more and more, and ask it each time.
 
-    Held-out motion is exact and the same for all learners; what is told is read with
-    noise. The error is of the mean over the learner's hypotheses. A physics posterior
-    takes in as many samples as its table holds (`teaching.taught`).
+    Held-out motion is exact, from the same states as what is told, and the same for all
+    learners; what is told is read with noise. The error is of the mean over the
+    learner's hypotheses. A physics posterior takes in as many samples as its table
+    holds (`teaching.taught`).
 
     Args:
         agent: name of a recipe, such as `physics` or `lwr`.
@@ -84,7 +85,9 @@ def _each_seed(
     sizes: tuple[int, ...],
     reading_noise: Float[Array, "4"] | None,
 ) -> Iterator[SampleErrors]:
-    subject = subject_of(task, reading_noise)._replace(num_samples=sizes[-1])
+    subject = subject_of(task, reading_noise)._replace(
+        num_samples=sizes[-1], num_regressed=sizes[-1]
+    )
     model = RECIPES[agent].build(subject)
     held_key, told_key = jax.random.split(jax.random.key(0))
     held_out = unbiased_samples(held_key, task, params, num_samples=NUM_HELD_OUT)

@@ -4,6 +4,8 @@ The papers' pre-trained agents had "2000 unbiased samples from the reachable set
 random pushes, each held as long as a decision, go on for 400 steps from 50 random
 starts, goals being nothing to stop at, and every tenth step is a sample. All learners
 are taught the same ones, read with the run's own noise; none of them goes on learning.
+Samples are shuffled and the walks are of that length even where fewer samples are asked
+for, so that the first so many are from the same states as all.
 A regression takes in all. A physics posterior takes in the first of them that touched
 nothing, as many as its table has room for: beyond that numbers are known to a
 hundredth of a percent, and the time of a fit grows with its rows.
@@ -77,19 +79,20 @@ def unbiased_samples(
         task: what moves.
         params: the world.
         reading_noise: standard deviation of readings, as of `run_episode`.
-        num_samples: how many, rounded up to as many from each start.
+        num_samples: how many; walks are longer where they are more than usual.
 
     Returns:
-        The samples.
+        The samples, in random order.
     """
     scale = jnp.zeros(4) if reading_noise is None else jnp.asarray(reading_noise)
-    num_each = -(-num_samples // _NUM_ROLLOUTS)
+    key, order_key = jax.random.split(key)
+    num_each = -(-max(num_samples, NUM_SAMPLES) // _NUM_ROLLOUTS)
     sample = jax.jit(functools.partial(_rollout, task, num_each=num_each))
     keys = jax.random.split(key, _NUM_ROLLOUTS)
     rows = jax.vmap(lambda one: sample(one, params, scale))(keys)
-    # From each start in turn, so that the first rows are from many.
-    flat = [np.swapaxes(np.asarray(part), 0, 1) for part in rows]
-    return Samples(*(part.reshape(-1, *part.shape[2:]) for part in flat))
+    flat = [np.asarray(part).reshape(-1, *part.shape[2:]) for part in rows]
+    order = np.asarray(jax.random.permutation(order_key, len(flat[0])))[:num_samples]
+    return Samples(*(part[order] for part in flat))
 
 
 def _rollout(

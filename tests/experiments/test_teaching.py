@@ -30,6 +30,15 @@ def test_samples_are_steps_of_the_world(line):
 
 
 @pytest.mark.slow
+def test_few_samples_are_the_first_of_many(line):
+    """So that they are from the same states, however many are asked for."""
+    task, params, samples = line
+    few = unbiased_samples(jax.random.key(7), task, params, num_samples=30)
+    for part, whole in zip(few, samples, strict=True):
+        np.testing.assert_array_equal(part, whole[:30])
+
+
+@pytest.mark.slow
 def test_samples_are_read_with_noise():
     task = LineWorld()
     scale = jnp.array([0.0, 0.0, 0.1, 0.3])
