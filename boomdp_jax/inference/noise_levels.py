@@ -88,15 +88,16 @@ def with_levels(
         for place, k in enumerate(chosen)
     ]
     others = np.setdiff1d(each, chosen)
-    left = middle.take(others)
-    filtered = filter_points(targets, 0 * others, others, champion[others], left)
     # Rows of all that was filtered, for every structure and level.
     source = np.zeros((num_structures, num_levels), int)
     source[chosen] = np.arange(len(chosen) * num_levels).reshape(-1, num_levels)
     source[others] = len(chosen) * num_levels + np.arange(len(others))[:, None]
     rows = source.reshape(-1)
     parts = [(levels.noise, levels.filtered) for levels in found]
-    parts += [(left, filtered)] if len(others) else []
+    if others.size:
+        left = middle.take(others)
+        filtered = filter_points(targets, 0 * others, others, champion[others], left)
+        parts.append((left, filtered))
     noise, filtered = jax.tree.map(lambda *leaves: np.concatenate(leaves)[rows], *parts)
     best = chosen[:1]
     prior = log_prior_density(targets, 0 * best, best, champion[best])

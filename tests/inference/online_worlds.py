@@ -35,8 +35,16 @@ class Rows(NamedTuple):
         return state_from_array(parts[0]), parts[1], state_from_array(parts[2])
 
 
-def box_world(constraints: list[dict], *, is_hidden: bool = False) -> SceneSpec:
-    """The box seen from above; hidden, with everything unknown."""
+EVERYTHING = {"revolute": 1, "wheel": 1, "ground": 1}
+
+
+def box_world(
+    constraints: list[dict],
+    *,
+    is_hidden: bool = False,
+    unknown: dict[str, int] = EVERYTHING,
+) -> SceneSpec:
+    """The box seen from above; hidden, its density is unknown, too."""
     body = {
         "name": "box",
         "shape": {"type": "box", "half_extents": [0.3, 0.2]},
@@ -52,7 +60,7 @@ def box_world(constraints: list[dict], *, is_hidden: bool = False) -> SceneSpec:
             "dt": DT,
             "bodies": [body],
             "constraints": constraints,
-            "unknown": {"revolute": 1, "wheel": 1, "ground": 1},
+            "unknown": unknown,
         },
         source="test",
     )

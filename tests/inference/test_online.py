@@ -157,6 +157,27 @@ def test_a_belief_agrees_with_inference_on_all_rows_at_once(online, name):
     assert 0.5 < mass["sd"] / expected["sd"] < 1.5
 
 
+@pytest.mark.parametrize("unknown", [{}, {"revolute": 1}], ids=["no joint", "a pin"])
+def test_few_structures_are_all_asked_for_their_noise(unknown):
+    """None is left over, with one structure or with two that hold their own."""
+    spec = box_world([], is_hidden=True, unknown=unknown)
+    online = OnlineBelief(spec, capacity=CAPACITY, num_particles=NUM_PARTICLES)
+    belief = online.init(jax.random.key(0))
+    rows = simulate(3, ["free"] * 12)
+    # With the first rows a pin may still be.
+    belief, _ = followed(online, belief, Rows(*(part[:2] for part in rows)))
+    belief, _ = online.refit(belief)
+    belief, _ = followed(online, belief, Rows(*(part[2:] for part in rows)))
+    belief, _ = online.refit(belief)
+    posterior = online.posterior(belief)
+    mass = 0.24 * np.asarray(posterior.params.density)[:, 0]
+    weight = np.exp(np.asarray(posterior.log_weight))
+    mean = np.average(mass, weights=weight)
+    sd = np.sqrt(np.average((mass - mean) ** 2, weights=weight))
+    assert abs(mean - MASS) < 4 * sd < 0.2 * MASS
+    assert constraints(posterior) == []
+
+
 def test_forgetting_discounts_rows_by_their_age():
     rate = 0.9
     online = OnlineBelief(
