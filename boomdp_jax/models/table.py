@@ -9,6 +9,8 @@ from boomdp_jax.core.full_precision import full_precision
 
 # Of a column's mean: spreads below this share are rounding, not information.
 _LEAST_SPREAD = 1e-6
+# Of the largest number of a row, in units of the last place: the same.
+_ROUNDING = 16.0
 
 RETUNE_GROWTH = 1.5
 """By which factor rows grow until what is costly is chosen anew; less: oftener."""
@@ -161,14 +163,18 @@ def scaling_of(
         mask: which rows count.
 
     Returns:
-        Units; zero and one with no row, spread one where a column does not vary.
+        Units; zero and one with no row, spread one where a column does not vary, or by
+        no more than the rounding of the largest: a force along x, turned into another
+        frame or half a circle round, has some 1e-16 of itself along y.
     """
     weight = mask.astype(values.dtype)
     num = jnp.maximum(jnp.sum(weight), 1.0)
     mean = weight @ values / num
     square = weight @ (values - mean[None]) ** 2 / num
+    rounding = _ROUNDING * jnp.finfo(values.dtype).eps
+    largest = jnp.max(square + mean**2, initial=0.0)
     least = (_LEAST_SPREAD * jnp.abs(mean)) ** 2 + jnp.finfo(values.dtype).tiny
-    varies = square > least
+    varies = square > jnp.maximum(least, rounding**2 * largest)
     return Scaling(mean, jnp.where(varies, jnp.sqrt(jnp.where(varies, square, 1)), 1))
 
 

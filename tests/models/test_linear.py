@@ -49,6 +49,17 @@ def example(num=30):
     return inputs, targets, rng.normal(size=(6, 4)) + 5.0
 
 
+def test_a_push_along_another_axis_than_all_before_is_not_told_from_rounding():
+    """Whose slope, from some 1e-15 N, would move it by more than there is."""
+    angles = np.pi * np.array([0, 1, 0, 1, 1, 0, 1, 0])
+    inputs = 10.0 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    targets = inputs @ np.array([[0.1], [0.1]]) + 1e-3 * np.cos(np.arange(8))[:, None]
+    regressor = LinearRegression(capacity=10)
+    fit = regressor.tune(fit_of(regressor, inputs, targets))
+    told = predictions(regressor, fit, np.array([[0.0, 10.0], [10.0, 0.0]]))
+    np.testing.assert_allclose(told, [[0.0], [1.0]], atol=0.01)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("ridge", [1e-6, 1e-2, 3.0])
 def test_ridge_regression_is_least_squares_with_penalty_rows(ridge):

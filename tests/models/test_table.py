@@ -56,6 +56,20 @@ def test_scaling_is_that_of_numpy_and_spares_constants():
     np.testing.assert_array_equal(nothing.spread, 1.0)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_what_a_turn_leaves_of_a_force_along_an_axis_is_no_variation(dtype):
+    turns = np.pi * np.array([0, 1, 0, 2, 1]).astype(dtype)
+    push = np.array([10.0, 12.0, 9.0, 10.0, 11.0], dtype)
+    rows = np.stack([push * np.cos(turns), push * np.sin(turns)], axis=1)
+    assert np.ptp(rows[:, 1]) > 0
+    scaling = scaling_of(jnp.asarray(rows), jnp.ones(5, bool))
+    np.testing.assert_allclose(scaling.spread, [rows[:, 0].std(), 1.0], rtol=1e-6)
+    # Small beside others is not nothing.
+    rows[:, 1] = 1e-4 * np.arange(5)
+    scaling = scaling_of(jnp.asarray(rows), jnp.ones(5, bool))
+    np.testing.assert_allclose(scaling.spread[1], rows[:, 1].std(), rtol=1e-4)
+
+
 def test_squared_distances_are_those_between_points():
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(5, 3)), rng.normal(size=(7, 3))
