@@ -199,4 +199,7 @@ def add_ground(
             gear="0 0 0 0 0 1",
         )
         ET.SubElement(actuators, "general", law)
-    return [f"{name}: the limit of a foot depends on direction, by up to 6 %"]
+    return [
+        f"{name}: friction of what slides is within 6 % in size, and up to 22.5 "
+        "degrees off its direction"
+    ]

@@ -7,8 +7,11 @@ a foot becomes four directions, 45° apart, of
 
 $$c_k = \tfrac12 c, \qquad d_k = \tfrac{\pi}{8} d,$$
 
-which are isotropic while the foot sticks and within 6 % of $d$ when it slips. MuJoCo
-has no coefficient of restitution: a spring and damper give it back.
+which are isotropic while the foot sticks. When it slips they all have reached their
+limits, and their sum has one of eight directions: as large as $d$ within 6 % along the
+motion, and up to 22.5° off it, so that the path of what slides bends towards the
+nearest of them. MuJoCo has no coefficient of restitution: a spring and damper give it
+back.
 """
 
 import math

@@ -57,8 +57,9 @@ def to_mjcf(
     joint friction that do not reach a limit. Near are (and said in the document):
     ranges, rods and joints that close a loop, which are MuJoCo's soft constraints; dry
     friction of joints; limits of a wheel, a box where ours are an ellipse; the floor
-    under feet, within 6 %; contact and restitution. All but the box and the 6 % go
-    with the time step.
+    under feet, whose friction on what slides is within 6 % in size and up to 22.5° off
+    its direction; contact and restitution. All but the box and the floor go with the
+    time step.
 
     Of "implicitfast" MuJoCo leaves out how a wheel couples directions, which costs
     accuracy ("implicit" has it), and MJX takes forces there to be unlimited: for

@@ -90,7 +90,7 @@ def checked_length(dt: Any, num_steps: int, dtype: Any) -> Array:
         A scalar or `[time]`.
 
     Raises:
-        ValueError: of another shape.
+        ValueError: of another shape, or a length known to be below zero.
     """
     length = jnp.asarray(dt, dtype)
     if length.shape not in ((), (num_steps,)):
@@ -98,7 +98,31 @@ def checked_length(dt: Any, num_steps: int, dtype: Any) -> Array:
             f"dt: expected one number, or one for each of {num_steps} steps; got shape "
             f"{length.shape}"
         )
+    _check_not_negative(dt)
     return length
+
+
+def checked_step_length(dt: Any, dtype: Any) -> Array:
+    """Length of one step.
+
+    Args:
+        dt: what was given.
+        dtype: of the result.
+
+    Raises:
+        ValueError: no single number, or one known to be below zero.
+    """
+    length = jnp.asarray(dt, dtype)
+    if length.shape != ():
+        raise ValueError(f"dt: expected one number; got shape {length.shape}")
+    _check_not_negative(dt)
+    return length
+
+
+def _check_not_negative(dt: Any) -> None:
+    # Time does not run back: what rubs would drive.
+    if not isinstance(dt, jax.core.Tracer) and np.any(np.asarray(dt) < 0):
+        raise ValueError(f"dt: expected at least 0 s; got {np.min(np.asarray(dt))}")
 
 
 def check_state_is_finite(state: State, names: Sequence[str]) -> None:

@@ -49,7 +49,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
@@ -57,6 +56,7 @@ from boomdp_jax.physics.actuator import applied, without_actuator
 from boomdp_jax.physics.arguments import (
     checked_length,
     checked_state,
+    checked_step_length,
     checked_wrench,
     checked_wrenches,
 )
@@ -110,11 +110,12 @@ def step(
 
     Raises:
         TypeError: a state that is none.
-        ValueError: a state or a wrench of another shape.
+        ValueError: a state or a wrench of another shape, a length that is no single
+            number or below zero.
     """
     state = checked_state(scene.num_bodies, state)
     wrench = checked_wrench(scene.num_bodies, wrench)
-    length = jnp.asarray(scene.dt if dt is None else dt, state.pose.dtype)
+    length = checked_step_length(scene.dt if dt is None else dt, state.pose.dtype)
     return _step_of(scene, params, length)(state, wrench, cache)
 
 
@@ -135,8 +136,11 @@ def prepare_step(
         A function from state and wrench `[body, 3]` to the next state and what there
         is to report; the same as `step`. It is a pytree of what was worked out, so
         that it may be batched by `vmap` and given to compiled functions.
+
+    Raises:
+        ValueError: a length that is no single number or below zero.
     """
-    length = jnp.asarray(scene.dt if dt is None else dt, scene.area.dtype)
+    length = checked_step_length(scene.dt if dt is None else dt, scene.area.dtype)
     return Partial(_without_cache, _step_of(scene, params, length))
 
 

@@ -142,6 +142,9 @@ def test_floor_brakes_within_the_stated_share():
         slid = math.hypot(*(path[-1, 0, :2] - spec.pose[0, :2]))
         # Below the knee the last of it is viscous.
         assert slid == pytest.approx(1.0 / (2 * 0.2 * 9.81), rel=0.065)
+        moved = path[-1, 0, :2] - spec.pose[0, :2]
+        bent = math.degrees(math.atan2(moved[1], moved[0]) - angle)
+        assert abs(bent) < 22.5
 
 
 @pytest.mark.slow
