@@ -184,3 +184,19 @@ def _masses(spec: SceneSpec, draws: Params, index: int) -> np.ndarray:
     if body.density is not None:
         density = np.full_like(density, body.density)
     return density * body.area
+
+
+def untouched_notes(spec: SceneSpec) -> list[str]:
+    """What to say of a scene with contact where inference knows none.
+
+    Args:
+        spec: the scene.
+
+    Returns:
+        One line, or none where nothing can collide.
+    """
+    colliding = [body for body in spec.bodies if body.has_contact]
+    if len(colliding) < 2 or all(body.is_static for body in colliding):
+        return []
+    names = ", ".join(body.name for body in colliding)
+    return [f"contact is left out, as if these never touched: {names}"]

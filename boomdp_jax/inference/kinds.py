@@ -17,6 +17,7 @@ from boomdp_jax.core.versions import library_versions
 from boomdp_jax.inference.arguments import check_arguments
 from boomdp_jax.inference.assemble import assemble_posterior
 from boomdp_jax.inference.chain_diagnostics import diagnose_chains
+from boomdp_jax.inference.contact_numbers import untouched_notes
 from boomdp_jax.inference.coordinates import Coordinates
 from boomdp_jax.inference.evidence_report import BlockResult
 from boomdp_jax.inference.kind_chains import (
@@ -338,7 +339,7 @@ def _posteriors(
             spec,
             results[scene],
             seconds={},
-            notes=_notes(objects, scene),
+            notes=[*_notes(objects, scene), *untouched_notes(spec)],
             method="kinds",
         )
         posteriors.append(

@@ -43,6 +43,7 @@ from boomdp_jax.inference.online_refit import (
     refit_block,
 )
 from boomdp_jax.inference.online_refresh import LEAVING_SHARE, OnlineInfo, refresh
+from boomdp_jax.inference.online_rows import step_length
 from boomdp_jax.inference.online_state import BeliefState, BlockBelief
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.physics.arguments import checked_state, checked_wrench
@@ -230,7 +231,8 @@ class OnlineBelief:
             belief: so far.
             state: reading before the step; NaN marks what is missing.
             wrench: at the centres of mass, held over the step [N, N, N m]. If it is not
-                finite, the transition tells nothing; info says so.
+                finite, or the length turns out not to be positive and finite under
+                `jit`, the transition tells nothing; info says so.
             next_state: reading after the step, NaN where missing.
             dt: length of the step [s], if lengths vary.
             starts_episode: whether bodies were moved otherwise since the last
@@ -240,15 +242,10 @@ class OnlineBelief:
             The belief, and what happened.
 
         Raises:
-            ValueError: a step length where all are equal, or none where they vary;
-                states or a wrench of another shape.
+            ValueError: a step length where all are equal, or none where they vary, or
+                one that is not positive; states or a wrench of another shape.
         """
-        if (dt is None) != self._settings.is_uniform:
-            expected = "none" if self._settings.is_uniform else "seconds"
-            raise ValueError(
-                f"dt: expected {expected}, with has_varying_dt="
-                f"{not self._settings.is_uniform}; got {dt}"
-            )
+        length = step_length(dt, self._dt, is_uniform=self._settings.is_uniform)
         num = self.spec.num_bodies
         # Of a given type, since for a weak one the same would be compiled again.
         before, after = (
@@ -256,7 +253,6 @@ class OnlineBelief:
             for name, part in (("state", state), ("next_state", next_state))
         )
         push = jnp.asarray(checked_wrench(num, wrench), float)
-        length = jnp.asarray(self._dt if dt is None else dt, float)
         begins = jnp.asarray(starts_episode, bool)
         return self._step(belief, before, push, after, length, begins)
 

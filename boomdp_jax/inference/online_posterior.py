@@ -10,7 +10,7 @@ from boomdp_jax.core.arrays import Key, on_device
 from boomdp_jax.inference.assemble import assemble_posterior, merge_params
 from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics
-from boomdp_jax.inference.contact_numbers import with_contact_numbers
+from boomdp_jax.inference.contact_numbers import untouched_notes, with_contact_numbers
 from boomdp_jax.inference.decode import decode
 from boomdp_jax.inference.evidence_report import BlockResult
 from boomdp_jax.inference.noise import host_generator
@@ -54,7 +54,12 @@ def online_posterior(
             rows = rng.permutation(systematic(rng, weight, len(weight)))
         results.append(_result(rng, spec, block, belief, rows))
     posterior = assemble_posterior(
-        assemble_key, spec, results, seconds={}, notes=[], method="online"
+        assemble_key,
+        spec,
+        results,
+        seconds={},
+        notes=untouched_notes(spec),
+        method="online",
     )
     if log_weight is None:
         return posterior

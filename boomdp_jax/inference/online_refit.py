@@ -56,7 +56,8 @@ class BlockRefit(NamedTuple):
     """What a refit found out about one block of bodies."""
 
     log_evidence: float
-    """Of the account that was taken."""
+    """Of the account that was taken; NaN where it went on from particles that were near
+    already, which tell nothing of it."""
     log_odds_of_change: float | None
     """Two worlds against one, prior odds included; None where nobody asked."""
     changed_at: int | None

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar
-from boomdp_jax.inference.online_rows import append_row, new_row, shift_rows
+from boomdp_jax.inference.online_rows import append_row, can_happen, new_row, shift_rows
 from boomdp_jax.inference.online_state import BeliefState
 from boomdp_jax.inference.online_step import (
     ALARM,
@@ -42,7 +42,8 @@ class OnlineInfo(NamedTuple):
     is_surprised: Bool[Array, " block"]
     """Readings have looked unlike what was expected for several rows."""
     is_finite: BoolScalar
-    """False where the wrench was not: the transition told nothing."""
+    """False where the wrench was not, or the length not that of a step: the transition
+    told nothing."""
     num_rows: IntScalar
     """Rows in the table after the step."""
     num_left: IntScalar
@@ -120,7 +121,7 @@ def refresh(
         is_stale=is_stale,
         is_degenerate=is_degenerate,
         is_surprised=info.is_surprised,
-        is_finite=jnp.all(jnp.isfinite(wrench)),
+        is_finite=can_happen(wrench, dt),
         num_rows=index + 1,
         num_left=jnp.where(is_full, num_left, 0),
     )

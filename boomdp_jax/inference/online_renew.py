@@ -51,8 +51,8 @@ class Renewed(NamedTuple):
 
     block: BlockBelief
     log_evidence: FloatScalar
-    """Of all rows, structures and noise averaged over; nothing where no particle was
-    drawn."""
+    """Of all rows, structures and noise averaged over; NaN where the last particles
+    were not drawn but kept, whose density is known up to a factor."""
     effective_sample_size: FloatScalar
     """Of the last weights."""
     num_rounds: IntScalar
@@ -107,6 +107,7 @@ def renew(
         pairs = jnp.where(is_over, pairs, _NUM_PAIRS)
         block = move_particles(move_key, block, end, 2 * NUM_PARTS * pairs).block
         block = eqx.tree_at(lambda b: b.mixture, block, fit_mixture(block))
+        log_evidence = jnp.where(is_kept, jnp.nan, log_evidence)
         return key, Renewed(block, log_evidence, size, before.num_rounds + 1)
 
     def is_going_on(carry: tuple[Key, Renewed]) -> BoolScalar:

@@ -1,8 +1,10 @@
 """The table of an online belief: a new row at its end, old ones off its front."""
 
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import jax
+import jax.core
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -24,6 +26,35 @@ class NewRow(NamedTuple):
     is_chained: BoolScalar
 
 
+def can_happen(action: Float[Array, "body 3"], dt: FloatScalar) -> BoolScalar:
+    """Whether wrenches and a length are those of a step."""
+    return jnp.all(jnp.isfinite(action)) & jnp.isfinite(dt) & (dt > 0)
+
+
+def step_length(dt: Any, usual: float, *, is_uniform: bool) -> Array:
+    """Length of a step as it was given, or the usual one.
+
+    Args:
+        dt: what was given, None for the usual one.
+        usual: of all steps [s].
+        is_uniform: whether all are equal.
+
+    Raises:
+        ValueError: a length where all are equal, or none where they vary; one that is
+            known not to be positive and finite.
+    """
+    if (dt is None) != is_uniform:
+        expected = "none" if is_uniform else "seconds"
+        raise ValueError(
+            f"dt: expected {expected}, with has_varying_dt={not is_uniform}; got {dt}"
+        )
+    if dt is None or isinstance(dt, jax.core.Tracer):
+        return jnp.asarray(usual if dt is None else dt, float)
+    if not 0 < float(dt) < math.inf:
+        raise ValueError(f"dt: expected positive seconds, got {dt}")
+    return jnp.asarray(dt, float)
+
+
 def new_row(
     history: History,
     num_rows: IntScalar,
@@ -35,9 +66,9 @@ def new_row(
 ) -> NewRow:
     """Sort out what was read, and how the row hangs together with the one before.
 
-    Readings that are not finite count as missing. A wrench that is not finite leaves
-    nothing that could be learnt from the row: all its readings count as missing, and
-    what was known of the state is lost.
+    Readings that are not finite count as missing. A wrench that is not finite or a
+    length that no step has leaves nothing that could be learnt from the row: all its
+    readings count as missing, and what was known of the state is lost.
 
     Args:
         history: the table so far.
@@ -48,7 +79,7 @@ def new_row(
         dt: length of the step [s].
         starts_episode: whether bodies were moved between the last row and this one.
     """
-    is_pushed = jnp.all(jnp.isfinite(action))
+    is_pushed = can_happen(action, dt)
     first = jnp.isfinite(state) & is_pushed
     last = jnp.isfinite(next_state) & is_pushed
     state = jnp.where(first, state, 0.0).astype(history.state.dtype)
@@ -62,7 +93,7 @@ def new_row(
         state=state,
         action=jnp.where(is_pushed, action, 0.0).astype(history.action.dtype),
         next_state=next_state,
-        dt=dt.astype(history.dt.dtype),
+        dt=jnp.where(is_pushed, dt, history.dt[before]).astype(history.dt.dtype),
         state_mask=first,
         next_state_mask=last,
         starts_episode=starts_episode,

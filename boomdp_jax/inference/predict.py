@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -51,7 +52,8 @@ def predict(
         posterior: what is believed.
         history: readings and wrenches that it has not seen.
         horizons: steps ahead, one number or several.
-        num_draws: draws rolled out from each start.
+        num_draws: draws rolled out from each start; of a posterior with fewer each is,
+            with noise of its own, as often as it takes.
         key: random key; default: that of seed 0.
 
     Returns:
@@ -77,7 +79,7 @@ def predict(
     if not np.any(history.mask):
         raise ValueError("history: expected at least one row, got none")
     key = jax.random.key(0) if key is None else key
-    kept = posterior.thin(num_draws)
+    kept = _enough_draws(posterior, num_draws)
     scene = posterior.spec.scene
     moments = _predict_rows(
         key,
@@ -101,6 +103,24 @@ def predict(
             report[str(horizon)] = _score(at_horizon, table, horizon, is_static)
     counts = {str(h): len(usable_starts(table, h, is_static)) for h in horizons}
     return plain({"schema": SCHEMA, "horizons": report, "num_starts": counts})
+
+
+def _enough_draws(posterior: Posterior, num_draws: int) -> Posterior:
+    """Draws of equal weight; few are all rolled out several times.
+
+    Noise is drawn for each: one hypothesis foretells a spread as well.
+    """
+    kept = posterior.thin(num_draws)
+    times = -(-num_draws // kept.num_draws)
+    if times == 1:
+        return kept
+    rows = np.tile(np.arange(kept.num_draws), times)
+
+    def parts(p: Posterior) -> tuple:
+        return p.params, p.noise_scale, p.impulse_scale
+
+    repeated = jax.tree.map(lambda leaf: leaf[rows], parts(kept))
+    return eqx.tree_at(parts, kept, repeated, is_leaf=lambda leaf: leaf is None)
 
 
 def _sorted_horizons(horizons: Any) -> list[int]:

@@ -168,7 +168,10 @@ def test_few_structures_are_all_asked_for_their_noise(unknown):
     belief, _ = followed(online, belief, Rows(*(part[:2] for part in rows)))
     belief, _ = online.refit(belief)
     belief, _ = followed(online, belief, Rows(*(part[2:] for part in rows)))
-    belief, _ = online.refit(belief)
+    belief, again = online.refit(belief)
+    # Particles that are kept tell nothing of the evidence.
+    assert again.blocks[0].is_warm
+    assert np.isnan(again.blocks[0].log_evidence)
     posterior = online.posterior(belief)
     mass = 0.24 * np.asarray(posterior.params.density)[:, 0]
     weight = np.exp(np.asarray(posterior.log_weight))

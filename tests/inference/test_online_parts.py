@@ -8,6 +8,7 @@ import pytest
 
 from boomdp_jax.core.history import make_history
 from boomdp_jax.inference import OnlineBelief
+from boomdp_jax.inference.contact_numbers import untouched_notes
 from boomdp_jax.inference.kalman import Estimate, NoiseLevel
 from boomdp_jax.inference.mixture_building import add_spare_components
 from boomdp_jax.inference.online_likelihood import _chunks
@@ -21,6 +22,7 @@ from boomdp_jax.inference.online_rows import (
     append_track_row,
     new_row,
     shift_rows,
+    step_length,
     track_row_of,
 )
 from boomdp_jax.inference.online_state import (
@@ -33,6 +35,7 @@ from boomdp_jax.inference.online_state import (
 )
 from boomdp_jax.inference.online_step import _watch, _Weights
 from boomdp_jax.inference.track_data import track_data
+from boomdp_jax.physics import scene_spec_from_dict
 from tests.inference.linear_gaussian import (
     closed_form,
     in_use,
@@ -133,6 +136,42 @@ def test_a_wrench_that_is_not_finite_leaves_nothing_read():
     assert not np.any(new.state_mask)
     assert not np.any(new.next_state_mask)
     assert np.all(np.isfinite(new.action))
+
+
+@pytest.mark.parametrize("length", [np.nan, np.inf, 0.0, -0.1])
+def test_a_length_of_no_step_leaves_nothing_read(length):
+    history, _ = appended(10)
+    reading = jnp.ones((1, 6))
+    push = jnp.ones((1, 3))
+    new = new_row(
+        history,
+        jnp.asarray(10),
+        reading,
+        push,
+        reading,
+        jnp.asarray(length),
+        jnp.asarray(False),
+    )
+    assert not np.any(new.state_mask)
+    assert not np.any(new.next_state_mask)
+    assert new.dt == history.dt[9] > 0
+    with pytest.raises(ValueError, match="dt: expected positive seconds, got"):
+        step_length(length, 0.1, is_uniform=False)
+
+
+def test_what_could_collide_is_said_where_contact_is_left_out():
+    def scene(*contacts):
+        bodies = [
+            {"name": name, "shape": {"type": "circle", "radius": 0.1}, **more}
+            for name, more in zip("abc", contacts, strict=True)
+        ]
+        scene = {"schema": "planar-scene-1", "dt": 0.02, "bodies": bodies}
+        return scene_spec_from_dict(scene)
+
+    collides = {"contact": {"friction": 0.3, "restitution": 0.1}}
+    notes = untouched_notes(scene(collides, {}, collides))
+    assert notes == ["contact is left out, as if these never touched: a, c"]
+    assert untouched_notes(scene(collides, {}, {})) == []
 
 
 def test_the_oldest_rows_leave_off_the_front():

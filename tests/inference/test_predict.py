@@ -43,11 +43,12 @@ def pushed_table(num_episodes=30, num_rows=12, seed=0):
     return state, action, next_state, episode
 
 
-def score(state, action, next_state, episode):
+def score(state, action, next_state, episode, num_hypotheses=NUM_DRAWS):
     history = make_history(
         state, action, next_state, DT, episode=episode, capacity=CAPACITY
     )
-    return predict(free_posterior(), history, HORIZONS, num_draws=NUM_DRAWS)
+    posterior = free_posterior(num_hypotheses)
+    return predict(posterior, history, HORIZONS, num_draws=NUM_DRAWS)
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +100,18 @@ def test_the_baseline_misses_what_the_force_adds(report):
         np.sqrt((0.5 * added * elapsed) ** 2 + 2 * sd["position"] ** 2), rel=0.2
     )
     assert scores["velocity"]["rmse"] < 0.3 * scores["velocity"]["baseline_rmse"]
+
+
+@pytest.mark.parametrize("num_hypotheses", [1, 25])
+def test_few_hypotheses_foretell_as_wide_a_spread(report, num_hypotheses):
+    """They differ in nothing here; what is foretold is noise, drawn as often."""
+    few = score(*pushed_table(), num_hypotheses)
+    for horizon in map(str, HORIZONS):
+        for channel, scores in report["horizons"][horizon].items():
+            found = few["horizons"][horizon][channel]
+            assert found["rmse"] == pytest.approx(scores["rmse"], rel=0.05)
+            assert found["coverage90"] == pytest.approx(scores["coverage90"], abs=0.05)
+            assert found["log_score"] == pytest.approx(scores["log_score"], abs=0.05)
 
 
 def test_starts_do_not_cross_an_episode(report):
