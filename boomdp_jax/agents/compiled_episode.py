@@ -22,7 +22,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from boomdp_jax.agents.agent import Agent
-from boomdp_jax.agents.episode import EpisodeRecord, position_error, read_state
+from boomdp_jax.agents.episode import (
+    EpisodeRecord,
+    position_error,
+    read_state,
+    scale_of_readings,
+)
 from boomdp_jax.core.arrays import IntScalar, Key
 from boomdp_jax.envs.environment import AbstractEnvironment, EnvParams, EnvState
 from boomdp_jax.physics.state import State
@@ -60,14 +65,15 @@ def compile_episode(
         not a number; compilation counts in neither.
 
     Raises:
-        ValueError: an agent whose model learns on the host, or that explores there.
+        ValueError: an agent whose model learns on the host, or that explores there;
+            noise as of `run_episode`.
     """
     if not can_compile(agent):
         raise ValueError(
             f"agent: expected one whose model is compiled, without `explore`; got "
             f"{agent.name} with {type(agent.model).__name__}"
         )
-    scale = jnp.zeros(4) if reading_noise is None else jnp.asarray(reading_noise)
+    scale = scale_of_readings(reading_noise)
     jitted: Any = eqx.filter_jit(_episode)
     program = jitted.lower(jax.random.key(0), task, params, agent, scale)
     compiled = program.compile()

@@ -9,10 +9,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int, PyTree
 
 from boomdp_jax.agents.agent import Agent
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, Key
+from boomdp_jax.core.checked_input import reading_scale
 from boomdp_jax.envs.environment import AbstractEnvironment, EnvParams
 from boomdp_jax.models.model import AbstractModel
 from boomdp_jax.physics.state import State, state_from_array
@@ -75,13 +77,17 @@ def run_episode(
 
     Returns:
         What happened, and what the model has learnt now.
+
+    Raises:
+        ValueError: noise that is not four numbers, or one that is negative or not
+            finite.
     """
+    scale = scale_of_readings(reading_noise)
     start_key, init_key, noise_key, act_key = jax.random.split(key, 4)
     compiled = _compiled(task)
     _, now = compiled.reset(start_key, params)
     if learnt is None:
         learnt = agent.model.init(init_key)
-    scale = jnp.zeros(4) if reading_noise is None else jnp.asarray(reading_noise)
     noise_keys = jax.random.split(noise_key, task.num_steps + 1)
     act_keys = jax.random.split(act_key, task.num_steps)
     reading = read_state(noise_keys[0], now.physics, scale)
@@ -131,6 +137,21 @@ def run_episode(
         reading = next_reading
         num_left -= 1
     return record, learnt
+
+
+def scale_of_readings(
+    reading_noise: Float[Array, "4"] | None,
+) -> Float[Array, "4"]:
+    """Standard deviations for `read_state`; checked unless they are traced.
+
+    Args:
+        reading_noise: as of `run_episode`.
+    """
+    if reading_noise is None:
+        return jnp.zeros(4)
+    if not isinstance(reading_noise, Tracer):
+        reading_scale("reading_noise", reading_noise)
+    return jnp.asarray(reading_noise)
 
 
 class _Compiled(NamedTuple):

@@ -100,7 +100,7 @@ def _table(first: LoadedRun, found: list[Score]) -> list[str]:
         regret = "" if score.regret is None else f"{score.regret:.2f}"
         lines.append(
             f"{score.agent:<32} {score.num_seeds:>5} {score.total:>9.1f} "
-            f"{score.total_error:>7.1f} {regret:>7} {_steps(score.marks)} "
+            f"{_error(score.total_error)} {regret:>7} {_steps(score.marks)} "
             f"{_milliseconds(score.decision)} {_milliseconds(score.learning)}"
         )
     for published in PUBLISHED.get(first.setting, ()):
@@ -109,6 +109,11 @@ def _table(first: LoadedRun, found: list[Score]) -> list[str]:
             f"{_steps(published.marks)}"
         )
     return lines
+
+
+def _error(error: float) -> str:
+    """Seven characters; one seed does not tell."""
+    return f"{'-':>7}" if np.isnan(error) else f"{error:>7.1f}"
 
 
 def _steps(marks: tuple[int | None, ...]) -> str:

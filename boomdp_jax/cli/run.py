@@ -44,11 +44,18 @@ def run(arguments: argparse.Namespace) -> None:
         print(f"{len(missing)} seeds are missing, of other shards", file=sys.stderr)
         return
     total = results["reward"].sum(axis=1)
-    error = total.std(ddof=1) / np.sqrt(len(total)) if len(total) > 1 else np.nan
     print(
-        f"{begun.task}, {begun.agent}: return {total.mean():.1f} +- {error:.1f} "
-        f"(standard error, {len(total)} seeds); {begun.folder / 'results.npz'}"
+        f"{begun.task}, {begun.agent}: return {_with_error(total)}; "
+        f"{begun.folder / 'results.npz'}"
     )
+
+
+def _with_error(total: np.ndarray) -> str:
+    """Mean over seeds, and how sure it is; one seed does not tell."""
+    if len(total) == 1:
+        return f"{total[0]:.1f} (1 seed)"
+    error = total.std(ddof=1) / np.sqrt(len(total))
+    return f"{total.mean():.1f} +- {error:.1f} (standard error, {len(total)} seeds)"
 
 
 def _run_namo(arguments: argparse.Namespace) -> None:

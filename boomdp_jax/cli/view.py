@@ -109,8 +109,10 @@ def find_files(data: str, scene: str | None) -> tuple[str, list[str]]:
 
     Raises:
         ValueError: a file without a scene, or a folder without either.
+        OSError: there is no such file or folder.
     """
     folder = Path(data)
+    folder.stat()  # Before anything is asked for that goes with it.
     if not folder.is_dir():
         if scene is None:
             raise ValueError(

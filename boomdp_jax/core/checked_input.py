@@ -73,6 +73,28 @@ def real_array(name: str, values: Any) -> np.ndarray:
     return np.asarray(array, float)
 
 
+def reading_scale(name: str, values: Any) -> Float[np.ndarray, "4"]:
+    """Read standard deviations of position, angle, velocity and spin.
+
+    Args:
+        name: of the argument, for the message.
+        values: what was given.
+
+    Returns:
+        The four numbers in 64 bit.
+
+    Raises:
+        ValueError: another shape, or a number that is negative or not finite.
+    """
+    array = real_array(name, values)
+    wanted = f"{name}: expected four finite numbers, at least 0, got"
+    if array.shape != (4,):
+        raise ValueError(f"{wanted} shape {array.shape}")
+    if not np.all(np.isfinite(array) & (array >= 0.0)):
+        raise ValueError(f"{wanted} {array.tolist()}")
+    return array
+
+
 def episode_array(values: Any, num_rows: int) -> Int[np.ndarray, " time"]:
     """Read which run each row belongs to.
 

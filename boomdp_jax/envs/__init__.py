@@ -16,6 +16,7 @@ from boomdp_jax.envs.blocking import stopped_by_boxes as stopped_by_boxes
 from boomdp_jax.envs.cart import Cart as Cart
 from boomdp_jax.envs.cart_worlds import CART_WORLDS as CART_WORLDS
 from boomdp_jax.envs.cart_worlds import CartWorld as CartWorld
+from boomdp_jax.envs.checked_room import check_room as check_room
 from boomdp_jax.envs.environment import AbstractEnvironment as AbstractEnvironment
 from boomdp_jax.envs.environment import EnvParams as EnvParams
 from boomdp_jax.envs.environment import EnvState as EnvState
@@ -48,7 +49,6 @@ from boomdp_jax.envs.namo_drive import pushing as pushing
 from boomdp_jax.envs.namo_room import Robot as Robot
 from boomdp_jax.envs.namo_room import Room as Room
 from boomdp_jax.envs.namo_room import Thing as Thing
-from boomdp_jax.envs.namo_room import check_room as check_room
 from boomdp_jax.envs.namo_room import room_params as room_params
 from boomdp_jax.envs.namo_room import room_scene as room_scene
 from boomdp_jax.envs.namo_rooms import is_solvable as is_solvable

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, Key
+from boomdp_jax.core.checked_input import whole_number
 from boomdp_jax.envs.action_set import ActionSet
 from boomdp_jax.envs.environment import (
     AbstractEnvironment,
@@ -68,7 +69,7 @@ class Acrobot(AbstractEnvironment):
         wrench = jnp.zeros((3, 2, 3), float)
         wrench = wrench.at[:, 0, 2].set(-turn).at[:, 1, 2].set(turn)
         self.actions = ActionSet(wrench)
-        self.num_steps = num_steps
+        self.num_steps = whole_number("num_steps", num_steps, 1)
         self.hints = PlanningHints(
             cell_size=(0.2, 0.2, 0.8, 0.8),
             stratum_size=(0.8, 0.8, 3.2, 3.2),

@@ -3,12 +3,14 @@
 import dataclasses
 import functools
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import on_device
+from boomdp_jax.core.checked_input import real_array
 from boomdp_jax.envs.mobile_arm import ARM_BODIES, MobileArm
 from boomdp_jax.physics.params import Params, Weld
 from boomdp_jax.physics.scene import Scene
@@ -16,6 +18,8 @@ from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
 from boomdp_jax.physics.state import State
 
 _TIME_STEP = 0.02
+# Angles of 32 bit may be this far beyond a limit that they are at [rad].
+_ROUNDING = 1e-6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -125,7 +129,12 @@ def arm_scene(
 
     Returns:
         The scene; the robot's bodies come first.
+
+    Raises:
+        ValueError: not five finite numbers, an angle beyond the joint's limit, or what
+            is no scene.
     """
+    _check_configuration(robot, configuration)
     content = {
         "schema": "planar-scene-1",
         "gravity": [0.0, 0.0],
@@ -134,6 +143,21 @@ def arm_scene(
         "constraints": [*robot.constraints(), *constraints],
     }
     return ArmScene(robot, scene_spec_from_dict(content, source))
+
+
+def _check_configuration(robot: MobileArm, configuration: Any) -> None:
+    numbers = real_array("configuration", configuration)
+    if numbers.shape != (5,) or not np.all(np.isfinite(numbers)):
+        raise ValueError(
+            f"configuration: expected five finite numbers, got {numbers.tolist()}"
+        )
+    joints = zip(("shoulder", "elbow"), numbers[3:], robot.joint_limit, strict=True)
+    for joint, angle, limit in joints:
+        if abs(angle) > limit + _ROUNDING:
+            raise ValueError(
+                f"configuration: expected an angle of the {joint} within {limit:g} rad "
+                f"to either side, got {angle:g}"
+            )
 
 
 def with_open_grasp(params: Params, forearm: int) -> Params:

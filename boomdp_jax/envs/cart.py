@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, Key
+from boomdp_jax.core.checked_input import whole_number
 from boomdp_jax.envs.action_set import forces_round_circle
 from boomdp_jax.envs.cart_worlds import CartWorld, Corners, cart_world_of
 from boomdp_jax.envs.environment import (
@@ -166,7 +167,7 @@ class Cart(AbstractEnvironment):
         self.spec = cart_scene(is_known=False, world=self._world)
         self._truth = cart_scene(is_known=True, world=self._world)
         self.actions = forces_round_circle(1, 0, FORCE, 8, with_nothing=False)
-        self.num_steps = num_steps
+        self.num_steps = whole_number("num_steps", num_steps, 1)
         self.hints = PlanningHints(
             cell_size=(0.25, 0.25, 0.8),
             stratum_size=(1.0, 1.0, np.inf),

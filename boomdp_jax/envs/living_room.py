@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar, Key
+from boomdp_jax.core.checked_input import whole_number
 from boomdp_jax.envs.action_set import ActionSet, forces_round_circle, join_actions
 from boomdp_jax.envs.blocking import Boxes, box_separation, stopped_by_boxes
 from boomdp_jax.envs.environment import (
@@ -73,7 +74,7 @@ class LivingRoom(AbstractEnvironment):
         ]
         nothing = ActionSet(jnp.zeros((1, num_bodies, 3)))
         self.actions = join_actions([*sets, nothing])
-        self.num_steps = num_steps
+        self.num_steps = whole_number("num_steps", num_steps, 1)
         self.hints = PlanningHints(
             cell_size=(0.08, 0.08, 0.4),
             stratum_size=(0.32, 0.32, np.inf),

@@ -59,7 +59,8 @@ class ManipulatorPlanner:
 
     Raises:
         ValueError: a margin that is less than half of the resolution, so that bodies
-            could touch between two configurations that are checked.
+            could touch between two configurations that are checked, or a least place
+            that is not below the greatest.
     """
 
     world: ArmScene
@@ -86,6 +87,10 @@ class ManipulatorPlanner:
             raise ValueError(
                 "margin: expected at least half of the resolution "
                 f"({self.resolution:g} m), got {self.margin!r}"
+            )
+        if not np.all(np.asarray(self.lower) < np.asarray(self.upper)):
+            raise ValueError(
+                f"lower: expected numbers below upper = {self.upper}, got {self.lower}"
             )
 
     def grasps(

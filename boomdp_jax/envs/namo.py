@@ -16,10 +16,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar, Key, on_device
+from boomdp_jax.envs.checked_room import check_room
 from boomdp_jax.envs.namo_room import (
     NUM_SUBSTEPS,
     Room,
-    check_room,
     room_params,
     room_scene,
 )

@@ -13,8 +13,9 @@ from types import MappingProxyType
 
 import numpy as np
 
+from boomdp_jax.envs.checked_room import check_room
 from boomdp_jax.envs.free_space import FreeSpace, pose_table
-from boomdp_jax.envs.namo_room import KINDS, LOOKS, Robot, Room, Thing, check_room
+from boomdp_jax.envs.namo_room import KINDS, LOOKS, Robot, Room, Thing
 from boomdp_jax.physics.scene_spec import STANDARD_GRAVITY
 from boomdp_jax.planning.regions import label_regions
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, Key
+from boomdp_jax.core.checked_input import whole_number
 from boomdp_jax.envs.action_set import forces_round_circle
 from boomdp_jax.envs.environment import (
     AbstractEnvironment,
@@ -64,7 +65,7 @@ class Pendulum(AbstractEnvironment):
         self.spec = pendulum_scene(is_known=False)
         weight = DENSITY * np.pi * RADIUS**2 * GRAVITY
         self.actions = forces_round_circle(1, 0, FORCE_SHARE * weight, 8)
-        self.num_steps = num_steps
+        self.num_steps = whole_number("num_steps", num_steps, 1)
         self.hints = PlanningHints(
             cell_size=(0.1, 0.3),
             stratum_size=(0.4, 1.2),

@@ -104,6 +104,9 @@ class BraxTask:
 
         Returns:
             The next state; entries that wrappers made in `metrics` and `info` are kept.
+
+        Raises:
+            ValueError: an action of more or fewer numbers than `action_size`.
         """
         before: EnvState = state.pipeline_state
         wrench = self.actions.wrench(action).astype(before.physics.pose.dtype)

@@ -40,9 +40,14 @@ def task_randomisation(
         world of another number of bodies with a ValueError.
 
     Raises:
+        TypeError: neither hypotheses nor a posterior.
         ValueError: hypotheses without leading axis, or with more than one; a posterior
             of other bodies than the task's.
     """
+    if not isinstance(draws, Params | Posterior):
+        raise TypeError(
+            f"draws: expected Params or a Posterior, got {type(draws).__name__}"
+        )
     if isinstance(draws, Posterior):
         if task is not None:
             check_same_bodies(draws.spec, task.spec, "draws")

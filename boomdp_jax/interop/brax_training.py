@@ -84,10 +84,14 @@ def train_ppo(
         The policy; unpacks like what brax's `train` returns.
 
     Raises:
+        TypeError: a task that is not a `BraxTask`; also from `task_randomisation`.
         ValueError: less than no time steps; also from `task_randomisation`.
     """
     from brax.training.agents.ppo import networks
 
+    # Wrappers of brax are let through.
+    if not isinstance(getattr(env, "unwrapped", env), BraxTask):
+        raise TypeError(f"env: expected a BraxTask, got {type(env).__name__}")
     if num_timesteps < 0:
         raise ValueError(f"num_timesteps: expected at least 0, got {num_timesteps}")
     factory = functools.partial(

@@ -49,7 +49,14 @@ class ContinuousActions(eqx.Module):
 
         Returns:
             On every body, world frame [N, N, N m].
+
+        Raises:
+            ValueError: more or fewer numbers than `size`.
         """
+        if jnp.shape(action) != (self.size,):
+            raise ValueError(
+                f"action: expected shape ({self.size},), got {jnp.shape(action)}"
+            )
         action = jnp.clip(action, -1.0, 1.0)
         num_numbers = self.basis.shape[1]
         way = 0 if self.num_ways == 1 else jnp.argmax(action[num_numbers:])

@@ -14,6 +14,12 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
+from boomdp_jax.core.checked_input import (
+    episode_array,
+    has_shape,
+    reading_scale,
+    real_array,
+)
 from boomdp_jax.core.transition_table import TransitionTable
 from boomdp_jax.interop.mjcf import RecordingLaws, has_contacts, world_text
 from boomdp_jax.interop.mjcf_document import load_mujoco
@@ -55,7 +61,9 @@ def record(
 
     Raises:
         ValueError: more than one body, more constraints than MuJoCo is asked to carry
-            here, or a time step that does not divide the scene's.
+            here, a time step that does not divide the scene's, or wrenches, runs or
+            starts that do not fit each other or are not finite.
+        RuntimeError: MuJoCo became unstable, and put the object back by itself.
         ImportError: MuJoCo is not installed.
     """
     laws = RecordingLaws() if laws is None else laws
@@ -66,29 +74,37 @@ def record(
             f"laws: expected a time step that divides dt = {truth.dt} s, got "
             f"{laws.time_step}"
         )
-    wrenches = np.asarray(wrenches, float)
+    wrenches = _finite_rows("wrenches", wrenches)
     num_rows = len(wrenches)
-    episode = np.zeros(num_rows, int) if episode is None else np.asarray(episode)
+    given = np.zeros(num_rows, int) if episode is None else episode
+    episode = episode_array(given, num_rows)
     first = np.flatnonzero(np.diff(episode, prepend=np.nan))
     if start is None:
-        pose = np.nan_to_num(truth.pose[0])
-        start = np.broadcast_to(pose, (len(first), 3))
+        start = np.tile(np.nan_to_num(truth.pose[0]), (len(first), 1))
+    # The pin says where a pinned object is.
+    used = slice(2 if params.revolute.active.any() else 0, 3)
+    start = _finite_rows("start", start, len(first), used=used)
     world = _World.build(truth, params, laws)
     state = np.zeros((num_rows, 1, 6))
     next_state = np.zeros((num_rows, 1, 6))
     ends = [*first[1:], num_rows]
     for begin, end, pose in zip(first, ends, start, strict=True):
-        world.reset(np.asarray(pose, float))
+        world.reset(pose)
         for row in range(begin, end):
             state[row, 0] = world.state()
             world.push(wrenches[row], num_ticks)
             next_state[row, 0] = world.state()
+            if not world.is_stable():
+                raise RuntimeError(
+                    "wrenches: expected some under which MuJoCo is stable, got "
+                    f"{wrenches[row].tolist()} in row {row}, where it is not"
+                )
     return TransitionTable(
         state=state,
         action=wrenches[:, None, :].copy(),
         next_state=next_state,
         dt=np.full(num_rows, truth.dt),
-        episode=episode.astype(np.int32),
+        episode=episode,
         point=None,
         params=None,
         source="recording",
@@ -113,14 +129,34 @@ def with_reading_noise(
 
     Returns:
         The noisy table.
+
+    Raises:
+        ValueError: not four numbers, or one that is negative or not finite.
     """
-    sd = np.asarray(scale, float)[_CHANNEL]
+    sd = reading_scale("scale", scale)[_CHANNEL]
     state = table.state + sd * rng.standard_normal(table.state.shape)
     next_state = table.next_state + sd * rng.standard_normal(table.state.shape)
     if is_chained:
         follows = np.flatnonzero(np.diff(table.episode) == 0) + 1
         state[follows] = next_state[follows - 1]
     return dataclasses.replace(table, state=state, next_state=next_state)
+
+
+def _finite_rows(
+    name: str, values: Any, num_rows: int | None = None, *, used: slice = slice(None)
+) -> Float[np.ndarray, "row 3"]:
+    """Rows of three numbers; from one that is not finite MuJoCo would start afresh."""
+    rows = real_array(name, values)
+    if not has_shape(rows.shape, ("row" if num_rows is None else num_rows, 3)):
+        wanted = "[time, 3]" if num_rows is None else f"{(num_rows, 3)}"
+        raise ValueError(f"{name}: expected shape {wanted}, got {rows.shape}")
+    is_wrong = ~np.isfinite(rows[:, used]).all(axis=1)
+    if np.any(is_wrong):
+        row = int(np.argmax(is_wrong))
+        raise ValueError(
+            f"{name}: expected finite numbers, got {rows[row].tolist()} in row {row}"
+        )
+    return rows
 
 
 def _single_object(truth: SceneSpec) -> Params:
@@ -196,6 +232,18 @@ class _World:
         """Hold a wrench at the centre of mass for a record step."""
         self.data.body("object").xfrc_applied[[0, 1, 5]] = wrench
         self.mujoco.mj_step(self.model, self.data, num_ticks)
+
+    def is_stable(self) -> bool:
+        """Whether MuJoCo has put nothing back to the beginning since `reset`."""
+        warning = self.mujoco.mjtWarning
+        return not any(
+            self.data.warning[int(each)].number
+            for each in (
+                warning.mjWARN_BADQPOS,
+                warning.mjWARN_BADQVEL,
+                warning.mjWARN_BADQACC,
+            )
+        )
 
     def state(self) -> Float[np.ndarray, "6"]:
         """Pose and twist of the centre of mass."""

@@ -5,7 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from boomdp_jax.agents import make_agent, random_agent, run_episode
+from boomdp_jax.agents import (
+    compile_episode,
+    make_agent,
+    random_agent,
+    run_episode,
+)
 from boomdp_jax.envs import Cart
 from boomdp_jax.models import (
     BodyRegression,
@@ -90,6 +95,26 @@ def test_numbers_below_one_are_refused(field):
 def test_a_probability_is_one():
     with pytest.raises(ValueError, match=r"exploration: expected in \[0, 1\], got 2"):
         knowing(LineWorld(), exploration=2.0)
+
+
+@pytest.mark.usefixtures("no_type_checks")
+@pytest.mark.parametrize(
+    ("noise", "got"),
+    [
+        (0.1, r"shape \(\)"),
+        (jnp.full(3, 0.1), r"shape \(3,\)"),
+        (jnp.array([0.5, 0.5, -0.5, 0.5]), r"\[0\.5, 0\.5, -0\.5, 0\.5\]"),
+        (jnp.array([0.5, jnp.inf, 0.5, 0.5]), r"\[0\.5, inf, 0\.5, 0\.5\]"),
+    ],
+)
+@pytest.mark.parametrize("way", [run_episode, compile_episode])
+def test_reading_noise_is_four_finite_numbers(way, noise, got):
+    task = LineWorld()
+    agent, params = knowing(task)
+    key = [jax.random.key(0)] if way is run_episode else []
+    message = f"^reading_noise: expected four finite numbers, at least 0, got {got}$"
+    with pytest.raises(ValueError, match=message):
+        way(*key, task, params, agent, reading_noise=noise)
 
 
 @pytest.fixture(scope="module")

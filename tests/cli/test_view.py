@@ -160,6 +160,8 @@ def test_missing_readings_are_drawn_between_others(
             "expected an existing folder",
         ),
         ("view none.npz --scene scene.json --out film.gif", "none.npz: No such file"),
+        ("view none.npz --out film.gif", "none.npz: No such file"),
+        ("view none --out film.html", "none: No such file"),
         ("view data.npz --scene none.json --out film.gif", "none.json: No such file"),
         ("view scene.json --scene scene.json --out film.gif", "expected an NPZ file"),
         ("view bare --out film.html", "bare: expected scene.json in the folder, got"),

@@ -122,3 +122,9 @@ def test_planned_motions_are_free_when_looked_at_ten_times_as_closely():
 def test_margin_that_is_used_up_between_two_points_is_refused():
     with pytest.raises(ValueError, match="margin: expected at least half of the res"):
         planner(margin=0.01, resolution=0.04)
+
+
+def test_least_place_that_is_not_below_the_greatest_is_refused():
+    message = r"^lower: expected numbers below upper = \(3\.0, -2\.0\), got \(-3\.0, 2"
+    with pytest.raises(ValueError, match=message):
+        ManipulatorPlanner(WORLD, straight, (-3.0, 2.0), (3.0, -2.0))

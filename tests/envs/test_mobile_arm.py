@@ -130,3 +130,32 @@ def test_scene_without_the_robot_is_refused():
     content |= {"constraints": [], "bodies": content["bodies"][:2]}
     with pytest.raises(ValueError, match="body: expected one of robot base, robot up"):
         ArmScene(ROBOT, scene_spec_from_dict(content))
+
+
+@pytest.mark.usefixtures("no_type_checks")
+@pytest.mark.parametrize(
+    ("configuration", "message"),
+    [
+        (FOLDED[:4], r"expected five finite numbers, got \[-1\.4, 0\.2, 0\.0, 1\.4\]$"),
+        (
+            [0.0, np.nan, 0.0, 0.0, 0.0],
+            r"expected five finite numbers, got .* nan",
+        ),
+        (
+            [0.0, 0.0, 0.0, 2.0, 0.0],
+            r"expected an angle of the shoulder within 1\.9 rad to either side, got 2$",
+        ),
+        (
+            [0.0, 0.0, 0.0, 0.0, -2.7],
+            r"expected an angle of the elbow within 2\.6 rad .*, got -2\.7$",
+        ),
+    ],
+)
+def test_configuration_that_the_arm_cannot_have_is_refused(configuration, message):
+    with pytest.raises(ValueError, match=f"^configuration: {message}"):
+        arm_scene(ROBOT, configuration, [])
+
+
+def test_arm_may_start_at_its_limits_in_single_precision():
+    limit = ROBOT.joint_limit.astype(np.float32)
+    arm_scene(ROBOT, np.array([0.0, 0.0, 9.0, *limit], np.float32), [])

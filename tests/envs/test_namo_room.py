@@ -108,6 +108,34 @@ def test_rooms_that_are_some_are_let_through():
         ),
         ({"start": (-1.0, 2.0)}, r"start: expected a place between .* got \[-1\.0"),
         ({"goal": (1.0, 4.5)}, r"goal: expected a place between .* got \[1\.0, 4\.5"),
+        (
+            {"things": (thing(pose=(5.5, math.nan, 0.0)),)},
+            r"'box': pose: expected finite numbers, got \(5\.5, nan, 0\.0\)",
+        ),
+        (
+            {"things": (thing(kind="wheels", axle=(math.nan, 0.0, 0.0)),)},
+            r"'box': axle: expected finite numbers, got \(nan, 0\.0, 0\.0\)",
+        ),
+        (
+            {"things": (thing(pose=(7.0, 0.5, 0.0)),)},
+            r"'box': pose: expected its middle between \[0\.0, 0\.0\] .* got \[7\.0",
+        ),
+        (
+            {"things": (thing(pose=(1.5, 2.0, 0.0)),)},
+            r"'box': pose: expected 0\.35 m from the robot's start at .* got 0\.2 m",
+        ),
+        (
+            {"start": (0.2, 2.0)},
+            r"start: expected the robot's radius of 0\.35 m .* 0\.2 m from walls\[0\]",
+        ),
+        (
+            {"goal": (3.1, 1.0)},
+            r"goal: expected the robot's .* got -0\.1 m from wa",
+        ),
+        (
+            {"walls": tuple(room().walls[i] for i in (2, 3, 0, 1, 4, 5))},
+            r"^walls: expected left, bottom, right and top first, .* got \[6\.2, 4",
+        ),
     ],
 )
 def test_what_is_no_room_is_refused(changes, message):

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from boomdp_jax.envs import Acrobot, Cart, Pendulum
+from boomdp_jax.envs import Acrobot, Cart, LivingRoom, Pendulum
 
 TASKS = {"pendulum": Pendulum, "cart": Cart, "acrobot": Acrobot}
 
@@ -82,3 +82,11 @@ def test_a_scene_hides_what_is_to_be_found(task):
     assert all(body.density is None for body in task.spec.bodies)
     assert task.spec.unknown
     assert not np.any(np.isnan(np.asarray(task.default_params().physics.density)))
+
+
+@pytest.mark.usefixtures("no_type_checks")
+@pytest.mark.parametrize("make", [*TASKS.values(), LivingRoom])
+def test_an_episode_has_a_whole_number_of_steps(make):
+    for num_steps in (0, -5, 1.5, True):
+        with pytest.raises(ValueError, match=r"^num_steps: expected .*at least 1, got"):
+            make(num_steps=num_steps)

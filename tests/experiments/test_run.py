@@ -1,5 +1,7 @@
 """Runs in a folder: resumed to the same bits, shared between shards, never mixed."""
 
+import re
+
 import jax
 import numpy as np
 import pytest
@@ -161,6 +163,16 @@ def test_the_command_line_runs_and_goes_on(tmp_path, capsys):
     assert stored["reward"].shape == (2, 4)
     assert cli.main([*command, "--out", str(folder), "--noise", *"1111"]) == 2
     assert "noise" in capsys.readouterr().err
+
+
+def test_one_seed_has_no_standard_error(tmp_path, capsys):
+    folder = tmp_path / "out"
+    command = ["run", "pendulum", "--agent", "random", "--steps", "4", "--seeds", "1"]
+    assert cli.main([*command, "--out", str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert re.match(r"pendulum, random: return -\d+\.\d \(1 seed\); ", said)
+    assert cli.main(["plot", str(folder)]) == 0
+    assert "nan" not in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -89,3 +89,11 @@ def test_a_posterior_of_another_outline_is_refused():
 def test_a_negative_number_of_steps_is_refused():
     with pytest.raises(ValueError, match="num_timesteps: expected at least 0, got -1"):
         train_ppo(BraxTask(Pendulum()), num_timesteps=-1)
+
+
+@pytest.mark.usefixtures("no_type_checks")
+def test_what_is_no_task_of_brax_or_no_hypothesis_is_refused():
+    with pytest.raises(TypeError, match=r"^env: expected a BraxTask, got Pendulum$"):
+        train_ppo(Pendulum())
+    with pytest.raises(TypeError, match=r"^draws: expected Params or .* got str$"):
+        train_ppo(BraxTask(Pendulum()), draws="x")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from boomdp_jax.envs import Acrobot, ActionSet, Cart, LivingRoom, Pendulum
-from boomdp_jax.interop import continuous_actions
+from boomdp_jax.interop import BraxTask, continuous_actions
 
 SIZES = {Pendulum: 2, Cart: 2, Acrobot: 1, LivingRoom: 3 + 12}
 
@@ -94,3 +94,12 @@ def test_several_bodies_pushed_in_unlike_ways_are_refused():
     wrench = jnp.ones((2, 2, 3)).at[0, 0, 0].set(2.0)
     with pytest.raises(ValueError, match="expected wrenches on several bodies at once"):
         continuous_actions(ActionSet(wrench))
+
+
+@pytest.mark.usefixtures("no_type_checks")
+@pytest.mark.parametrize("shape", [(1,), (3,), (), (4, 2)])
+def test_an_action_of_another_length_is_refused(shape):
+    env = BraxTask(Pendulum())
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    with pytest.raises(ValueError, match=r"^action: expected shape \(2,\), got \("):
+        jax.eval_shape(env.step, state, jnp.zeros(shape))

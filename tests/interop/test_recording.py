@@ -311,6 +311,74 @@ def test_time_step_must_divide_the_record_step():
         record(scene(), np.zeros((1, 3)), laws=RecordingLaws(time_step=0.0007))
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"wrenches": [[0.0, 0.0, 0.0], [0.0, np.nan, 0.0]]},
+            r"^wrenches: expected finite numbers, got \[0\.0, nan, 0\.0\] in row 1$",
+        ),
+        (
+            {"wrenches": np.zeros((4, 2))},
+            r"^wrenches: expected shape \[time, 3\], got \(4, 2\)$",
+        ),
+        (
+            {"wrenches": np.zeros(3)},
+            r"^wrenches: expected shape \[time, 3\], got \(3,\)$",
+        ),
+        ({"episode": [0, 0, 1]}, r"^episode: expected shape \(4,\), got \(3,\)$"),
+        (
+            {"episode": [0, 1, 0, 1]},
+            "^episode: expected the rows of an episode to follow each other, got one",
+        ),
+        (
+            {"episode": [0, 0, 1, 1], "start": np.zeros((1, 3))},
+            r"^start: expected shape \(2, 3\), got \(1, 3\)$",
+        ),
+        (
+            {"start": [[0.0, np.inf, 0.0]]},
+            r"^start: expected finite numbers, got \[0\.0, inf, 0\.0\] in row 0$",
+        ),
+    ],
+)
+@pytest.mark.usefixtures("no_type_checks")
+def test_pushes_that_do_not_fit_each_other_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        record(scene(), **({"wrenches": np.zeros((4, 3))} | changes))
+
+
+@pytest.mark.usefixtures("no_type_checks")
+def test_only_the_angle_of_a_pinned_start_has_to_be_known():
+    table = record(scene(pin()), np.zeros((1, 3)), start=[[np.nan, np.nan, 0.3]])
+    assert table.state[0, 0, 2] == pytest.approx(0.3)
+
+
+def test_recording_in_which_mujoco_starts_afresh_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings into a file there.
+    wrenches = np.zeros((4, 3))
+    wrenches[2, 0] = 1e30
+    message = r"^wrenches: .* MuJoCo is stable, got \[1e\+30, 0\.0, 0\.0\] in row 2,"
+    with pytest.raises(RuntimeError, match=message):
+        record(scene(), wrenches)
+
+
+@pytest.mark.parametrize(
+    ("scale", "got"),
+    [
+        (0.1, r"shape \(\)"),
+        ((0.1, 0.1, 0.1), r"shape \(3,\)"),
+        ((0.1, 0.1, 0.1, -0.1), r"\[0\.1, 0\.1, 0\.1, -0\.1\]"),
+        ((0.1, np.nan, 0.1, 0.1), r"\[0\.1, nan, 0\.1, 0\.1\]"),
+    ],
+)
+@pytest.mark.usefixtures("no_type_checks")
+def test_reading_noise_is_four_finite_numbers(scale, got):
+    table = record(scene(), np.zeros((1, 3)))
+    message = f"^scale: expected four finite numbers, at least 0, got {got}$"
+    with pytest.raises(ValueError, match=message):
+        with_reading_noise(np.random.default_rng(0), table, scale)
+
+
 def test_missing_mujoco_is_named_with_its_cure(monkeypatch):
     def no_mujoco(name):
         raise ImportError(name)
