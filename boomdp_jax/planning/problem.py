@@ -78,10 +78,10 @@ class Problem(eqx.Module):
         def one(carry, number):
             state, reward, alive = carry
             now = key if self.action_repeat == 1 else jax.random.fold_in(key, number)
-            moved, done = self.transition_fn(now, hypothesis, state, action)
+            result = self.transition_fn(now, hypothesis, state, action)
+            moved, done = _checked_step(result, state)
             gain = jnp.asarray(self.reward_fn(hypothesis, state, action, moved))
             _check_scalar("reward_fn", gain)
-            _check_scalar("transition_fn: done", jnp.asarray(done))
             moved = jax.tree.map(_as_before, moved, state)
             if done is False:
                 # An episode without an end needs no looking whether it is over.
@@ -194,6 +194,44 @@ def check_state(state: PyTree) -> None:
                 f"state{name}: expected finite numbers to plan from; got "
                 f"{np.array2string(np.asarray(leaf), threshold=12)}"
             )
+
+
+def _checked_step(result: Any, state: PyTree) -> tuple[PyTree, Any]:
+    """The next state and whether that is the end, as a model has returned them.
+
+    An array of two numbers could be unpacked just as well.
+    """
+    if not isinstance(result, tuple) or len(result) != 2:
+        raise TypeError(
+            "transition_fn: expected a pair (next_state, done); got "
+            f"{_described(result)}"
+        )
+    moved, done = result
+    if jax.tree.structure(moved) != jax.tree.structure(state):
+        raise TypeError(
+            "transition_fn: expected a pair (next_state, done) with a next_state of "
+            f"the structure of the state, {_described(state)}; got {_described(moved)}"
+        )
+    leaves = jax.tree_util.tree_leaves_with_path(moved)
+    for (path, new), old in zip(leaves, jax.tree.leaves(state), strict=True):
+        if jnp.shape(new) != jnp.shape(old):
+            raise ValueError(
+                f"transition_fn: next_state{jax.tree_util.keystr(path)}: expected shape "
+                f"{jnp.shape(old)}, as in the state; got {jnp.shape(new)}"
+            )
+    if not jax.tree_util.all_leaves([done]):
+        raise TypeError(
+            f"transition_fn: done: expected one truth value; got {_described(done)}"
+        )
+    _check_scalar("transition_fn: done", jnp.asarray(done))
+    return moved, done
+
+
+def _described(value: Any) -> str:
+    """What kind of thing it is, for a message; a tracer is an array."""
+    if hasattr(value, "shape"):
+        return f"an array of shape {value.shape}"
+    return str(jax.tree.structure(value))
 
 
 def _is_inexact(leaf: Any) -> bool:
