@@ -131,13 +131,10 @@ def forward_search_sparse_sampling(
         discount=discount,
         action_repeat=action_repeat,
     )
-    for name, count in (
-        ("depth", depth),
-        ("num_samples", num_samples),
-        ("max_expansions", max_expansions),
-        ("num_hypotheses", num_hypotheses),
-    ):
-        check_positive(name, count)
+    depth = check_positive("depth", depth)
+    num_samples = check_positive("num_samples", num_samples)
+    max_expansions = check_positive("max_expansions", max_expansions)
+    num_hypotheses = check_positive("num_hypotheses", num_hypotheses)
     bounds = make_bounds(
         problem,
         depth,

@@ -148,6 +148,7 @@ def sparse_sampling(
         TypeError: a belief or a function that is none.
         ValueError: an option that is not known or of the wrong size; see the message.
     """
+    depth = check_positive("depth", depth)
     check_options(
         depth=depth,
         hypotheses=hypotheses,
@@ -158,8 +159,8 @@ def sparse_sampling(
         cell_size=cell_size,
         verify=verify,
     )
-    check_positive("num_hypotheses", num_hypotheses)
-    check_positive("capacity", capacity)
+    num_hypotheses = check_positive("num_hypotheses", num_hypotheses)
+    capacity = check_positive("capacity", capacity)
     check_state(state)
     problem = make_problem(
         transition_fn,
