@@ -349,6 +349,35 @@ def test_weights_that_are_traced_are_left_alone():
     assert np.isnan(jax.jit(value)(jnp.full(2, jnp.nan)))
 
 
+BROKEN = {
+    "reward_fn": lambda h, s, a, n: jnp.nan * s,
+    "transition_fn": lambda key, h, s, a: (jnp.nan * s, False),
+}
+
+
+@pytest.mark.parametrize("part", BROKEN)
+@pytest.mark.parametrize("verify", [False, True])
+def test_where_nothing_is_known_there_is_no_value(part, verify):
+    options = {**MODEL, part: BROKEN[part], "depth": 2, "verify": verify}
+    plan = sparse_sampling(KEY, certain(jnp.ones(())), jnp.asarray(0.0), **options)
+    np.testing.assert_array_equal(plan.q_values, [-np.inf] * 3)
+    np.testing.assert_array_equal(plan.hypothesis_q_values, [[-np.inf] * 3])
+    assert plan.value == -np.inf
+
+
+@pytest.mark.parametrize("risk", ["mean", "cvar", "worst"])
+def test_a_hypothesis_that_breaks_leaves_the_choice_to_the_others(risk):
+    hypotheses, options = jnp.array([1.0, jnp.nan]), {**MODEL, "depth": 2, "risk": risk}
+    broken = (hypotheses, jnp.array([0.0, 1.0]))
+    plan = sparse_sampling(KEY, broken, jnp.asarray(5.0), **options)
+    assert plan.index == 2
+    np.testing.assert_array_equal(plan.q_values, [-np.inf] * 3)
+    ruled_out = (hypotheses, jnp.array([0.0, -jnp.inf]))
+    plan = sparse_sampling(KEY, ruled_out, jnp.asarray(5.0), **options)
+    assert plan.index == 2
+    np.testing.assert_allclose(plan.q_values, [4.0 + 5.0, 5.0 + 6.0, 6.0 + 7.0])
+
+
 def test_a_function_that_is_none():
     with pytest.raises(TypeError, match="reward_fn"):
         sparse_sampling(
