@@ -138,16 +138,14 @@ def a_star(
         discount=discount,
         action_repeat=action_repeat,
     )
-    for name, count in (
-        ("depth", 1 if depth is None else depth),
-        ("max_expansions", max_expansions),
-        ("max_plan_length", max_plan_length),
-        ("num_expanded_at_once", num_expanded_at_once),
-        ("table_size", 1 if table_size is None else table_size),
-        ("max_probes", max_probes),
-        ("num_hypotheses", num_hypotheses),
-    ):
-        check_positive(name, count)
+    depth = None if depth is None else check_positive("depth", depth)
+    max_expansions = check_positive("max_expansions", max_expansions)
+    max_plan_length = check_positive("max_plan_length", max_plan_length)
+    num_expanded_at_once = check_positive("num_expanded_at_once", num_expanded_at_once)
+    if table_size is not None:
+        table_size = check_positive("table_size", table_size)
+    max_probes = check_positive("max_probes", max_probes)
+    check_positive("num_hypotheses", num_hypotheses)
     state = jax.tree.map(jnp.asarray, state)
     frontier = Frontier(
         problem,

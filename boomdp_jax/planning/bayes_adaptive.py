@@ -116,6 +116,8 @@ def adaptive_values(
 
     tree = jax.vmap(below)(belief.hypotheses)
     known = without_unknown(jax.vmap(root_values)(tree))
+    # An outcome of which all was dropped must not veto what led there.
+    known = jnp.where(known > -jnp.inf, known, 0.0)
     value = jnp.max(jnp.sum(weight[:, :, None] * known, axis=0), axis=-1)
     goes_on = flat.nodes.exists
     return_ = flat.reward + jnp.where(goes_on, flat.continuation * value, 0.0)

@@ -9,7 +9,9 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from boomdp_jax.core.arrays import IntScalar, Key
@@ -51,7 +53,8 @@ def as_belief(belief: Any) -> Belief:
 
     Raises:
         TypeError: none of these.
-        ValueError: no hypothesis, or another number of hypotheses than of weights.
+        ValueError: no hypothesis, another number of hypotheses than of weights, or
+            log-weights of which none is finite, or one NaN or +∞.
     """
     if isinstance(belief, Belief):
         hypotheses, log_weight = belief.hypotheses, belief.log_weight
@@ -70,6 +73,7 @@ def as_belief(belief: Any) -> Belief:
             "belief: log_weight has one number for each hypothesis; got shape "
             f"{log_weight.shape}"
         )
+    _check_weights(log_weight)
     for path, leaf in jax.tree_util.tree_leaves_with_path(hypotheses):
         if jnp.shape(leaf)[:1] != log_weight.shape:
             name = jax.tree_util.keystr(path) or "of hypotheses"
@@ -78,6 +82,18 @@ def as_belief(belief: Any) -> Belief:
                 f"axis of {log_weight.shape[0]} hypotheses, as many as weights"
             )
     return Belief(jax.tree.map(jnp.asarray, hypotheses), log_weight)
+
+
+def _check_weights(log_weight: Float[Array, " hypothesis"]) -> None:
+    """Raise unless they can be normalised, where they are known yet."""
+    if isinstance(log_weight, jax.core.Tracer):
+        return
+    values = np.asarray(log_weight)
+    if np.any(np.isnan(values) | (values == np.inf)) or np.all(values == -np.inf):
+        raise ValueError(
+            "belief: log_weight: expected numbers below infinity, at least one of them "
+            f"finite; got {np.array2string(values, threshold=12)}"
+        )
 
 
 def certain(hypothesis: PyTree) -> Belief:

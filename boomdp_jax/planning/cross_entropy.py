@@ -30,11 +30,12 @@ from boomdp_jax.planning.problem import (
     Problem,
     RewardFn,
     TransitionFn,
+    check_number,
     check_positive,
     check_state,
     make_problem,
 )
-from boomdp_jax.planning.rollouts import check_number, draw_rollouts, read_inputs
+from boomdp_jax.planning.rollouts import draw_rollouts, read_inputs
 from boomdp_jax.planning.sequence_plan import plan_of_indices, plan_of_vectors, shifted
 
 # What the shifted last plan weighs among the probabilities of listed actions at first:
@@ -107,11 +108,11 @@ def cross_entropy_method(
         discount=discount,
         action_repeat=action_repeat,
     )
-    belief, state = read_inputs(
+    belief, state, depth, num_hypotheses = read_inputs(
         belief, state, depth=depth, num_hypotheses=num_hypotheses
     )
-    check_positive("num_samples", num_samples)
-    check_positive("num_iterations", num_iterations)
+    num_samples = check_positive("num_samples", num_samples)
+    num_iterations = check_positive("num_iterations", num_iterations)
     check_number("elite_fraction", elite_fraction, "in (0, 1]", lambda x: 0 < x <= 1)
     check_number("smoothing", smoothing, "in [0, 1)", lambda x: 0 <= x < 1)
     check_number("min_sd", min_sd, "not below 0", lambda x: x >= 0)
@@ -127,7 +128,7 @@ def cross_entropy_method(
         num_hypotheses=num_hypotheses,
         num_samples=num_samples,
         num_iterations=num_iterations,
-        num_elites=max(1, round(elite_fraction * num_samples)),
+        num_elites=max(1, round(float(elite_fraction) * num_samples)),
         continuous=continuous,
     )
 

@@ -114,8 +114,9 @@ def forward_search_sparse_sampling(
 
     Returns:
         The plan. Where a return is not known exactly, its estimate is the middle
-        between the bounds. `sequence` follows the first draw of each action and repeats
-        the last one where the tree ends; `tree` is a `ForwardSearchReport`.
+        between the bounds; it is −∞ where a reward is not finite or a leaf value NaN.
+        `sequence` follows the first draw of each action and repeats the last one where
+        the tree ends; `tree` is a `ForwardSearchReport`.
 
     Raises:
         TypeError: an argument that should be a function or a belief is none.
@@ -131,13 +132,10 @@ def forward_search_sparse_sampling(
         discount=discount,
         action_repeat=action_repeat,
     )
-    for name, count in (
-        ("depth", depth),
-        ("num_samples", num_samples),
-        ("max_expansions", max_expansions),
-        ("num_hypotheses", num_hypotheses),
-    ):
-        check_positive(name, count)
+    depth = check_positive("depth", depth)
+    num_samples = check_positive("num_samples", num_samples)
+    max_expansions = check_positive("max_expansions", max_expansions)
+    num_hypotheses = check_positive("num_hypotheses", num_hypotheses)
     bounds = make_bounds(
         problem,
         depth,

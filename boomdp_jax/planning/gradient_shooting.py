@@ -31,13 +31,13 @@ from boomdp_jax.planning.problem import (
     Problem,
     RewardFn,
     TransitionFn,
+    check_number,
     check_positive,
     check_state,
     make_problem,
 )
 from boomdp_jax.planning.rollouts import (
     Rollouts,
-    check_number,
     draw_rollouts,
     read_inputs,
 )
@@ -104,11 +104,11 @@ def gradient_shooting(
         discount=discount,
         action_repeat=action_repeat,
     )
-    belief, state = read_inputs(
+    belief, state, depth, num_hypotheses = read_inputs(
         belief, state, depth=depth, num_hypotheses=num_hypotheses
     )
-    check_positive("num_starts", num_starts)
-    check_positive("num_steps", num_steps)
+    num_starts = check_positive("num_starts", num_starts)
+    num_steps = check_positive("num_steps", num_steps)
     check_number("learning_rate", learning_rate, "above 0", lambda x: x > 0)
     return _search(
         key,

@@ -58,7 +58,9 @@ class LazyTree(eqx.Module):
             best = most_promising(*self.action_bounds(node))
             chosen = jnp.where(level == 0, action, best)
             children = self.children(node)[chosen]
-            gap = self.upper[children] - self.lower[children]
+            lower, upper = self.lower[children], self.upper[children]
+            # Between two of −∞ there is none, not NaN.
+            gap = jnp.where(upper > lower, upper - lower, 0.0)
             child = children[jnp.argmax(self.continuation[children] * gap)]
             child = jnp.where(self.first_child[node] > 0, child, node)
             return child, child

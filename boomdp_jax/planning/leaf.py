@@ -85,7 +85,7 @@ def rollout_leaf(
         TypeError: not a function.
         ValueError: no step, or a discount outside (0, 1].
     """
-    check_positive("num_steps", num_steps)
+    num_steps = check_positive("num_steps", num_steps)
     # The policy's actions need not be listed: one stands for them all.
     problem = make_problem(transition_fn, reward_fn, 1, discount=discount)
     key = jax.random.key(0) if key is None else key

@@ -19,8 +19,7 @@ from jaxtyping import Array, Float, PyTree
 from boomdp_jax.core.arrays import FloatScalar, Key
 from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.planning.grid import CoordinatesFn, all_numbers
-from boomdp_jax.planning.problem import check_positive
-from boomdp_jax.planning.rollouts import check_number
+from boomdp_jax.planning.problem import check_number, check_positive
 
 
 class LearnedLeaf(eqx.Module):
@@ -90,7 +89,7 @@ def learned_leaf(
         ValueError: no state, another number of values than of states, or a number that
             is not positive.
     """
-    check_positive("num_features", num_features)
+    num_features = check_positive("num_features", num_features)
     for name, value in (("length_scale", length_scale), ("ridge", ridge)):
         check_number(name, value, "above 0", lambda number: number > 0)
     values = jnp.asarray(values, float)

@@ -108,11 +108,13 @@ def mctx_search(
         discount=discount,
         action_repeat=action_repeat,
     )
-    belief, state = read_inputs(
+    belief, state, depth, num_hypotheses = read_inputs(
         belief, state, depth=depth, num_hypotheses=num_hypotheses
     )
-    check_positive("num_simulations", num_simulations)
-    check_positive("max_num_considered_actions", max_num_considered_actions)
+    num_simulations = check_positive("num_simulations", num_simulations)
+    max_num_considered_actions = check_positive(
+        "max_num_considered_actions", max_num_considered_actions
+    )
     if policy not in _POLICIES:
         raise ValueError(f"policy: expected one of {_POLICIES}; got {policy!r}")
     try:

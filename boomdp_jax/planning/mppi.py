@@ -32,11 +32,12 @@ from boomdp_jax.planning.problem import (
     Problem,
     RewardFn,
     TransitionFn,
+    check_number,
     check_positive,
     check_state,
     make_problem,
 )
-from boomdp_jax.planning.rollouts import check_number, draw_rollouts, read_inputs
+from boomdp_jax.planning.rollouts import draw_rollouts, read_inputs
 from boomdp_jax.planning.sequence_plan import plan_of_vectors, shifted
 
 
@@ -105,11 +106,11 @@ def mppi(
         discount=discount,
         action_repeat=action_repeat,
     )
-    belief, state = read_inputs(
+    belief, state, depth, num_hypotheses = read_inputs(
         belief, state, depth=depth, num_hypotheses=num_hypotheses
     )
-    check_positive("num_samples", num_samples)
-    check_positive("num_iterations", num_iterations)
+    num_samples = check_positive("num_samples", num_samples)
+    num_iterations = check_positive("num_iterations", num_iterations)
     check_number("temperature", temperature, "above 0", lambda x: x > 0)
     check_number("noise_scale", noise_scale, "above 0", lambda x: x > 0)
     return _search(

@@ -3,9 +3,10 @@
 from typing import Any
 
 import equinox as eqx
+import numpy as np
 
 from boomdp_jax.planning.merging import OVERFLOW_POLICIES
-from boomdp_jax.planning.problem import check_positive
+from boomdp_jax.planning.problem import check_number, check_positive
 from boomdp_jax.planning.risk import RISK_MEASURES
 
 HYPOTHESES = ("root", "fresh", "map", "mean", "adaptive")
@@ -27,18 +28,15 @@ class Options(eqx.Module):
 
 def draws_by_level(num_samples: Any, depth: int) -> tuple[int, ...]:
     """One number of draws for each level."""
-    if isinstance(num_samples, int):
-        check_positive("num_samples", num_samples)
-        return (num_samples,) * depth
+    if isinstance(num_samples, int | np.integer):
+        return (check_positive("num_samples", num_samples),) * depth
     draws = tuple(num_samples)
     if len(draws) != depth:
         raise ValueError(
             f"num_samples: expected one number, or one for each of {depth} levels; got "
             f"{draws}"
         )
-    for number in draws:
-        check_positive("num_samples", number)
-    return draws
+    return tuple(check_positive("num_samples", number) for number in draws)
 
 
 def check_options(
@@ -53,7 +51,6 @@ def check_options(
     verify: bool,
 ) -> None:
     """Options that are names, and what goes with what."""
-    check_positive("depth", depth)
     for name, value, known in (
         ("hypotheses", hypotheses, HYPOTHESES),
         ("risk", risk, RISK_MEASURES),
@@ -61,8 +58,7 @@ def check_options(
     ):
         if value not in known:
             raise ValueError(f"{name}: expected one of {known}; got {value!r}")
-    if isinstance(risk_level, int | float) and not 0.0 < risk_level <= 1.0:
-        raise ValueError(f"risk_level: expected a number in (0, 1]; got {risk_level}")
+    check_number("risk_level", risk_level, "in (0, 1]", lambda x: 0.0 < x <= 1.0)
     if isinstance(cell_size, str) and cell_size != "auto":
         raise ValueError(
             f"cell_size: expected sizes, 'auto' or None; got {cell_size!r}"

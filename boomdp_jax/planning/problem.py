@@ -12,6 +12,7 @@ $\sum_{i<n} \gamma^i r_i$, and what follows counts by $\gamma^n$, or by nothing 
 the episode ended on the way.
 """
 
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, PyTree
 
 from boomdp_jax.core.arrays import FloatScalar, Key
 
@@ -78,10 +79,10 @@ class Problem(eqx.Module):
         def one(carry, number):
             state, reward, alive = carry
             now = key if self.action_repeat == 1 else jax.random.fold_in(key, number)
-            moved, done = self.transition_fn(now, hypothesis, state, action)
+            result = self.transition_fn(now, hypothesis, state, action)
+            moved, done = _checked_step(result, state)
             gain = jnp.asarray(self.reward_fn(hypothesis, state, action, moved))
             _check_scalar("reward_fn", gain)
-            _check_scalar("transition_fn: done", jnp.asarray(done))
             moved = jax.tree.map(_as_before, moved, state)
             if done is False:
                 # An episode without an end needs no looking whether it is over.
@@ -119,8 +120,8 @@ def make_problem(
     actions: PyTree | int,
     *,
     leaf_fn: LeafFn | None = None,
-    discount: float | Float[Array, ""] = 1.0,
-    action_repeat: int = 1,
+    discount: Any = 1.0,
+    action_repeat: Any = 1,
 ) -> Problem:
     """Check the parts that all planners share.
 
@@ -147,7 +148,12 @@ def make_problem(
     ):
         if not callable(function):
             raise TypeError(f"{name}: expected a function; got {function!r}")
-    if isinstance(actions, int):
+    if isinstance(actions, bool | np.bool_):
+        raise ValueError(
+            "actions: expected arrays with a leading axis `action`, or how many there "
+            f"are; got {actions}"
+        )
+    if isinstance(actions, int | np.integer):
         actions = jnp.arange(actions)
     actions = jax.tree.map(jnp.asarray, actions)
     shapes = [leaf.shape for leaf in jax.tree.leaves(actions)]
@@ -157,9 +163,8 @@ def make_problem(
             "actions: every leaf has a leading axis `action` of the same length, at "
             f"least 1; got shapes {shapes}"
         )
-    check_positive("action_repeat", action_repeat)
-    if isinstance(discount, int | float) and not 0.0 < discount <= 1.0:
-        raise ValueError(f"discount: expected a number in (0, 1]; got {discount}")
+    action_repeat = check_positive("action_repeat", action_repeat)
+    check_number("discount", discount, "in (0, 1]", lambda x: 0.0 < x <= 1.0)
     return Problem(
         transition_fn,
         reward_fn,
@@ -170,10 +175,28 @@ def make_problem(
     )
 
 
-def check_positive(name: str, count: Any) -> None:
-    """Raise unless a static count is a positive integer."""
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+def check_positive(name: str, count: Any) -> int:
+    """Read a static count; raise unless it is a positive integer, of whatever type."""
+    try:
+        number = 0 if isinstance(count, bool) else operator.index(count)
+    except TypeError:
+        number = 0
+    if number < 1:
         raise ValueError(f"{name}: expected a positive integer; got {count!r}")
+    return number
+
+
+def check_number(
+    name: str, value: Any, expected: str, is_valid: Callable[[Any], bool]
+) -> None:
+    """Raise unless a number, where it is known before the program runs, is valid.
+
+    That of an array is known too, unless it is traced.
+    """
+    if isinstance(value, jax.core.Tracer):
+        return
+    if not all(is_valid(number) for number in np.ravel(value)):
+        raise ValueError(f"{name}: expected a number {expected}; got {value}")
 
 
 def check_state(state: PyTree) -> None:
@@ -194,6 +217,45 @@ def check_state(state: PyTree) -> None:
                 f"state{name}: expected finite numbers to plan from; got "
                 f"{np.array2string(np.asarray(leaf), threshold=12)}"
             )
+
+
+def _checked_step(result: Any, state: PyTree) -> tuple[PyTree, Any]:
+    """The next state and whether that is the end, as a model has returned them.
+
+    An array of two numbers could be unpacked just as well.
+    """
+    if not isinstance(result, tuple) or len(result) != 2:
+        raise TypeError(
+            "transition_fn: expected a pair (next_state, done); got "
+            f"{_described(result)}"
+        )
+    moved, done = result
+    if jax.tree.structure(moved) != jax.tree.structure(state):
+        raise TypeError(
+            "transition_fn: expected a pair (next_state, done) with a next_state of "
+            f"the structure of the state, {_described(state)}; got {_described(moved)}"
+        )
+    leaves = jax.tree_util.tree_leaves_with_path(moved)
+    for (path, new), old in zip(leaves, jax.tree.leaves(state), strict=True):
+        if jnp.shape(new) != jnp.shape(old):
+            name = f"next_state{jax.tree_util.keystr(path)}"
+            raise ValueError(
+                f"transition_fn: {name}: expected shape {jnp.shape(old)}, as in the "
+                f"state; got {jnp.shape(new)}"
+            )
+    if not jax.tree_util.all_leaves([done]):
+        raise TypeError(
+            f"transition_fn: done: expected one truth value; got {_described(done)}"
+        )
+    _check_scalar("transition_fn: done", jnp.asarray(done))
+    return moved, done
+
+
+def _described(value: Any) -> str:
+    """What kind of thing it is, for a message; a tracer is an array."""
+    if hasattr(value, "shape"):
+        return f"an array of shape {value.shape}"
+    return str(jax.tree.structure(value))
 
 
 def _is_inexact(leaf: Any) -> bool:

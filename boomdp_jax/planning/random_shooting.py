@@ -82,10 +82,10 @@ def random_shooting(
         discount=discount,
         action_repeat=action_repeat,
     )
-    belief, state = read_inputs(
+    belief, state, depth, num_hypotheses = read_inputs(
         belief, state, depth=depth, num_hypotheses=num_hypotheses
     )
-    check_positive("num_samples", num_samples)
+    num_samples = check_positive("num_samples", num_samples)
     return _search(key, problem, belief, state, depth, num_hypotheses, num_samples)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
@@ -87,8 +88,9 @@ def make_bounds(
         if function is not None and not callable(function):
             raise TypeError(f"{name}: expected a function; got {function!r}")
     for name, pair in (("value_bounds", value_bounds), ("leaf_bounds", leaf_bounds)):
-        is_known = pair is not None and all(isinstance(b, int | float) for b in pair)
-        if pair is not None and is_known and not pair[0] <= pair[1]:
+        if pair is None or any(isinstance(bound, jax.core.Tracer) for bound in pair):
+            continue
+        if not pair[0] <= pair[1]:
             raise ValueError(f"{name}: expected (lower, upper), in order; got {pair}")
     if leaf_bounds is None:
         if problem.leaf_fn is not zero_leaf and (lower_fn is None or upper_fn is None):

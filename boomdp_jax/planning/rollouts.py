@@ -8,7 +8,6 @@ The noise of a hypothesis at a level is the same for all sequences: they differ 
 was done, not by luck.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -77,8 +76,8 @@ class Rollouts(eqx.Module):
 
 
 def read_inputs(
-    belief: Any, state: PyTree, *, depth: int, num_hypotheses: int
-) -> tuple[Belief, PyTree]:
+    belief: Any, state: PyTree, *, depth: Any, num_hypotheses: Any
+) -> tuple[Belief, PyTree, int, int]:
     """Check the arguments that all planners share beside the problem.
 
     Args:
@@ -88,23 +87,16 @@ def read_inputs(
         num_hypotheses: how many to plan under at most.
 
     Returns:
-        The belief, and the state as arrays.
+        The belief, the state as arrays, and both counts.
 
     Raises:
         TypeError: not a belief.
         ValueError: a count that is not positive, weights that do not fit.
     """
-    check_positive("depth", depth)
-    check_positive("num_hypotheses", num_hypotheses)
-    return as_belief(belief), jax.tree.map(jnp.asarray, state)
-
-
-def check_number(
-    name: str, value: Any, expected: str, is_valid: Callable[[Any], bool]
-) -> None:
-    """Raise unless a number, where it is known before the program runs, is valid."""
-    if isinstance(value, int | float) and not is_valid(value):
-        raise ValueError(f"{name}: expected a number {expected}; got {value}")
+    depth = check_positive("depth", depth)
+    num_hypotheses = check_positive("num_hypotheses", num_hypotheses)
+    state = jax.tree.map(jnp.asarray, state)
+    return as_belief(belief), state, depth, num_hypotheses
 
 
 def draw_rollouts(

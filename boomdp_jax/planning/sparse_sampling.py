@@ -46,7 +46,7 @@ from boomdp_jax.planning.problem import (
     make_problem,
 )
 from boomdp_jax.planning.replay import verified_values, with_previous
-from boomdp_jax.planning.risk import combine, without_unknown
+from boomdp_jax.planning.risk import choose, without_unknown
 from boomdp_jax.planning.tree import (
     Merging,
     Tree,
@@ -142,12 +142,14 @@ def sparse_sampling(
         keep_tree: whether to return the `Tree`, with the states of all levels.
 
     Returns:
-        The plan; leading axis `hypothesis` on all parts of its tree.
+        The plan; leading axis `hypothesis` on all parts of its tree. `q_values` are −∞
+        where no action has a finite return under a hypothesis that has weight.
 
     Raises:
         TypeError: a belief or a function that is none.
         ValueError: an option that is not known or of the wrong size; see the message.
     """
+    depth = check_positive("depth", depth)
     check_options(
         depth=depth,
         hypotheses=hypotheses,
@@ -158,8 +160,8 @@ def sparse_sampling(
         cell_size=cell_size,
         verify=verify,
     )
-    check_positive("num_hypotheses", num_hypotheses)
-    check_positive("capacity", capacity)
+    num_hypotheses = check_positive("num_hypotheses", num_hypotheses)
+    capacity = check_positive("capacity", capacity)
     check_state(state)
     problem = make_problem(
         transition_fn,
@@ -271,11 +273,14 @@ def _search(
     values = without_unknown(values)
     if previous is not None:
         values = with_previous(key, problem, roots, state, values, previous)
+        # Of a hypothesis under which it alone is known, the others are still unknown.
+        values = without_unknown(values)
         num_calls += (
             roots.num_hypotheses * len(options.num_samples) * (problem.action_repeat)
         )
-    q_values = combine(values, roots.weight, measure=options.risk, level=risk_level)
-    index = jnp.argmax(q_values)
+    index, q_values = choose(
+        values, roots.weight, measure=options.risk, level=risk_level
+    )
     return Plan(
         index=index,
         action=problem.action(index),

@@ -99,7 +99,8 @@ class Growth(eqx.Module):
                 state,
                 self.problem.action(action),
             )
-            return Family(outcome, *self.child_bounds(hypothesis, outcome, level + 1))
+            bounds = self.child_bounds(hypothesis, outcome, level + 1)
+            return _without_nan(Family(outcome, *bounds))
 
         return jax.vmap(child)(jnp.arange(num_actions * C, dtype=jnp.uint32))
 
@@ -115,6 +116,22 @@ class Growth(eqx.Module):
             return jnp.where(outcome.continuation > 0, value, 0.0)
 
         return choose(lower), choose(upper)
+
+
+def _without_nan(child: Family) -> Family:
+    """A child of which a number is not one: the end, at a reward of −∞.
+
+    So it is known to be the worst, and takes no part in any walk.
+    """
+    outcome, lower, upper = child
+    is_sound = jnp.isfinite(outcome.reward) & ~jnp.isnan(lower) & ~jnp.isnan(upper)
+    outcome = outcome._replace(
+        reward=jnp.where(is_sound, outcome.reward, -jnp.inf),
+        continuation=jnp.where(is_sound, outcome.continuation, 0.0),
+    )
+    return Family(
+        outcome, jnp.where(is_sound, lower, 0.0), jnp.where(is_sound, upper, 0.0)
+    )
 
 
 def _is_wider(

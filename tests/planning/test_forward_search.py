@@ -163,6 +163,63 @@ def test_a_hypothesis_that_is_ruled_out_has_no_say():
     np.testing.assert_allclose(found.value, expected.max(), rtol=1e-12)
 
 
+def steps(bad_reward=None, bad_leaf=None, belief=None, **options):
+    """Walk by 0 or 1 at a cost of 5, but for what is made bad."""
+
+    def reward_fn(hypothesis, state, action, after):
+        cost = -5.0 * hypothesis
+        return (
+            cost if bad_reward is None else jnp.where(bad_reward(after), jnp.nan, cost)
+        )
+
+    def leaf_fn(hypothesis, state):
+        return jnp.where(bad_leaf(state), jnp.nan, 0.0)
+
+    return forward_search_sparse_sampling(
+        KEY,
+        certain(jnp.asarray(1.0)) if belief is None else belief,
+        jnp.asarray(0.0),
+        transition_fn=lambda key, hypothesis, state, action: (state + action, False),
+        reward_fn=reward_fn,
+        leaf_fn=None if bad_leaf is None else leaf_fn,
+        leaf_bounds=None if bad_leaf is None else (0.0, 0.0),
+        actions=jnp.array([0.0, 1.0]),
+        value_bounds=(-10.0, 0.0),
+        **options,
+    )
+
+
+@pytest.mark.parametrize("num_samples", [1, 2])
+def test_an_action_of_a_nan_is_the_worst(num_samples):
+    for bad in ({"bad_reward": lambda s: s == 0}, {"bad_leaf": lambda s: s < 1}):
+        found = steps(**bad, depth=1, num_samples=num_samples)
+        np.testing.assert_array_equal(found.q_values, [-np.inf, -5.0])
+        assert found.index == 1
+    found = steps(lambda state: state == 0, depth=2, num_samples=num_samples)
+    np.testing.assert_array_equal(found.q_values, [-np.inf, -10.0])
+    assert found.index == 1
+
+
+def test_a_nan_below_is_walked_around():
+    """After the step there is nothing else; after staying there is."""
+    found = steps(lambda state: state >= 1, depth=3)
+    np.testing.assert_array_equal(found.q_values, [-15.0, -np.inf])
+    found = steps(lambda state: state == 2, depth=2)
+    np.testing.assert_array_equal(found.q_values, [-10.0, -10.0])
+    assert found.tree.is_exact
+    everywhere = steps(lambda state: state < 9, depth=3)
+    np.testing.assert_array_equal(everywhere.q_values, [-np.inf, -np.inf])
+    late = steps(lambda state: state >= 0, bad_leaf=lambda state: state < 9, depth=2)
+    assert late.value == -np.inf
+
+
+def test_a_nan_under_one_hypothesis_counts():
+    belief = (jnp.array([1.0, 0.5]), jnp.zeros(2))
+    found = steps(lambda state: state == 0, belief=belief, depth=2)
+    np.testing.assert_array_equal(found.q_values, [-np.inf, -7.5])
+    assert found.index == 1
+
+
 def test_a_large_belief_is_thinned():
     belief = belief_of(range(6), np.zeros(6))
     found = jax.eval_shape(lambda: traced(KEY, belief, 0, num_hypotheses=4))
@@ -324,6 +381,11 @@ def test_arrays_and_numbers_of_the_world_do_not_compile_anew():
         ({"num_hypotheses": 0}, ValueError, "num_hypotheses: expected a positive"),
         ({"value_bounds": None}, ValueError, "value_bounds: needed unless"),
         ({"value_bounds": (1.0, 0.0)}, ValueError, "value_bounds: .* in order"),
+        (
+            {"value_bounds": (jnp.asarray(1.0), jnp.asarray(0.0))},
+            ValueError,
+            "value_bounds: .* in order",
+        ),
         ({"leaf_bounds": (1.0, 0.0)}, ValueError, "leaf_bounds: .* in order"),
         ({"leaf_fn": leaf}, ValueError, "leaf_bounds: leaf_fn is given"),
         ({"discount": 1.5}, ValueError, "discount: expected a number"),

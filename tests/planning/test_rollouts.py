@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from boomdp_jax.planning.belief import Belief, certain
-from boomdp_jax.planning.problem import make_problem
-from boomdp_jax.planning.rollouts import check_number, draw_rollouts, read_inputs
+from boomdp_jax.planning.problem import check_number, make_problem
+from boomdp_jax.planning.rollouts import draw_rollouts, read_inputs
 from tests.planning import small_worlds as worlds
 
 
@@ -98,4 +98,29 @@ def test_number_is_checked_where_it_is_known():
     with pytest.raises(ValueError, match=r"rate: expected a number above 0; got -1.0"):
         check_number("rate", -1.0, "above 0", lambda x: x > 0)
     check_number("rate", 1.0, "above 0", lambda x: x > 0)
-    check_number("rate", jnp.asarray(-1.0), "above 0", lambda x: x > 0)
+    jax.jit(lambda rate: check_number("rate", rate, "above 0", lambda x: x > 0))(-1.0)
+
+
+@pytest.mark.parametrize("number", [np.float32(-1.0), np.nan, np.float32("nan")])
+@pytest.mark.parametrize("kind", [np.asarray, jnp.asarray, lambda number: number])
+def test_number_of_any_type_is_checked(kind, number):
+    with pytest.raises(ValueError, match=r"rate: expected a number above 0; got"):
+        check_number("rate", kind(number), "above 0", lambda x: x > 0)
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.uint8, jnp.asarray])
+def test_counts_are_whole_numbers_of_any_type(kind):
+    """Read as an int, without which they would be traced and not static."""
+    counts = read_inputs(certain(0.0), 0.0, depth=kind(2), num_hypotheses=kind(3))[2:]
+    assert counts == (2, 3)
+    assert [type(count) for count in counts] == [int, int]
+
+
+def test_problem_reads_numbers_of_any_type():
+    parts = worlds.move_in_table, worlds.table_reward
+    problem = make_problem(*parts, np.int64(3), action_repeat=np.int64(2))
+    np.testing.assert_array_equal(problem.actions, [0, 1, 2])
+    assert type(problem.action_repeat) is int
+    for bad in (np.float32(2.0), np.float32("nan"), jnp.asarray(0.0)):
+        with pytest.raises(ValueError, match=r"discount: expected .* in \(0, 1\]"):
+            make_problem(*parts, 3, discount=bad)

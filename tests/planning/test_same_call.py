@@ -1,6 +1,7 @@
 """What all comparators have in common: one call, and what it promises."""
 
 import functools
+import inspect
 
 import jax
 import jax.numpy as jnp
@@ -196,3 +197,14 @@ def test_continuous_planners_refuse_actions_that_span_no_box(planner):
             actions=3,
             depth=2,
         )
+
+
+def test_counts_of_other_types_make_the_same_plan(name):
+    """The shape checks of the tests refuse them before the function does."""
+    planner = inspect.unwrap(getattr(planning, name))
+    counts = OPTIONS[name] | {"depth": 3, "num_hypotheses": 2, "action_repeat": 1}
+    counts = {count: np.int64(value) for count, value in counts.items()}
+    belief, key = (SIGNS, jnp.array([0.5, 0.0])), jax.random.key(1)
+    options = {"transition_fn": drift, "reward_fn": reach_right, "actions": LEFT_RIGHT}
+    found = planner(key, belief, START, **options, **counts)
+    assert found.value == call(name, key, belief, START, num_hypotheses=2).value

@@ -290,11 +290,15 @@ def test_adaptive_root_is_the_other_where_nothing_is_seen():
         ({"overflow": "all"}, "overflow: expected one of"),
         ({"risk": "var"}, "risk: expected one of"),
         ({"risk_level": 0.0}, "risk_level"),
+        ({"risk_level": jnp.asarray(2.0)}, "risk_level: expected a number in"),
         ({"cell_size": "half"}, "cell_size: expected sizes, 'auto' or None"),
         ({"cell_size": [1.0, 2.0]}, "cell_size: expected one number or 1"),
         ({"cell_size": 0.0}, "cell_size: expected positive"),
         ({"capacity": 0}, "capacity"),
         ({"discount": 0.0}, "discount"),
+        ({"discount": jnp.asarray(2.0)}, "discount: expected a number in"),
+        ({"actions": True}, "actions: expected arrays .* or how many"),
+        ({"actions": np.True_}, "actions: expected arrays .* or how many"),
         ({"action_repeat": 0}, "action_repeat"),
         ({"actions": jnp.zeros((0, 2))}, "actions"),
         ({"actions": {"a": jnp.zeros(2), "b": jnp.zeros(3)}}, "actions"),
@@ -322,11 +326,56 @@ def test_bad_options_are_named(options, message):
         (jnp.zeros(3), TypeError, "belief: expected a Belief"),
         ((jnp.zeros(3), jnp.zeros(2)), ValueError, "expected a leading axis of 2"),
         ((jnp.zeros(3), jnp.zeros(())), ValueError, "one number for each hypothesis"),
+        (
+            (jnp.zeros(2), [0.0, jnp.nan]),
+            ValueError,
+            r"belief: log_weight.*nan\]",
+        ),
+        ((jnp.zeros(2), [0.0, jnp.inf]), ValueError, r"belief: log_weight.*inf\]"),
+        ((jnp.zeros(1), [-jnp.inf]), ValueError, r"at least one .* finite; got \[-inf"),
     ],
 )
 def test_bad_beliefs_are_named(belief, error, message):
     with pytest.raises(error, match=message):
         sparse_sampling(KEY, belief, jnp.asarray(0.0), depth=1, **MODEL)
+
+
+def test_weights_that_are_traced_are_left_alone():
+    def value(log_weight):
+        belief = (jnp.ones(2), log_weight)
+        return sparse_sampling(KEY, belief, jnp.asarray(0.0), depth=1, **MODEL).value
+
+    assert float(jax.jit(value)(jnp.array([0.0, -jnp.inf]))) == 1.0
+    assert np.isnan(jax.jit(value)(jnp.full(2, jnp.nan)))
+
+
+BROKEN = {
+    "reward_fn": lambda h, s, a, n: jnp.nan * s,
+    "transition_fn": lambda key, h, s, a: (jnp.nan * s, False),
+}
+
+
+@pytest.mark.parametrize("part", BROKEN)
+@pytest.mark.parametrize("verify", [False, True])
+def test_where_nothing_is_known_there_is_no_value(part, verify):
+    options = {**MODEL, part: BROKEN[part], "depth": 2, "verify": verify}
+    plan = sparse_sampling(KEY, certain(jnp.ones(())), jnp.asarray(0.0), **options)
+    np.testing.assert_array_equal(plan.q_values, [-np.inf] * 3)
+    np.testing.assert_array_equal(plan.hypothesis_q_values, [[-np.inf] * 3])
+    assert plan.value == -np.inf
+
+
+@pytest.mark.parametrize("risk", ["mean", "cvar", "worst"])
+def test_a_hypothesis_that_breaks_leaves_the_choice_to_the_others(risk):
+    hypotheses, options = jnp.array([1.0, jnp.nan]), {**MODEL, "depth": 2, "risk": risk}
+    broken = (hypotheses, jnp.array([0.0, 1.0]))
+    plan = sparse_sampling(KEY, broken, jnp.asarray(5.0), **options)
+    assert plan.index == 2
+    np.testing.assert_array_equal(plan.q_values, [-np.inf] * 3)
+    ruled_out = (hypotheses, jnp.array([0.0, -jnp.inf]))
+    plan = sparse_sampling(KEY, ruled_out, jnp.asarray(5.0), **options)
+    assert plan.index == 2
+    np.testing.assert_allclose(plan.q_values, [4.0 + 5.0, 5.0 + 6.0, 6.0 + 7.0])
 
 
 def test_a_function_that_is_none():
