@@ -88,6 +88,7 @@ def _sweep(arguments: argparse.Namespace, spec) -> None:
         spec,
         arguments.data,
         arguments.out,
+        shard=shard,
         batch=batch,
         num_rows=arguments.rows,
         **_options(arguments),

@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.core.history import History
+from boomdp_jax.inference.arguments import check_history, check_spec
 from boomdp_jax.inference.block import Block, make_block
 from boomdp_jax.inference.components import independent_blocks
 from boomdp_jax.inference.fitted_mixture import fitted_mixture
@@ -58,15 +59,13 @@ def structure_kernel(
         The kernel, for `numpyro.infer.MCMC`.
 
     Raises:
+        TypeError: a scene or history that is none.
         ValueError: several independent blocks and no `bodies`, or `bodies` that are
             not one of the blocks; the message lists them. A history of another number
             of bodies, or no body that can move.
     """
-    if history.num_bodies != spec.num_bodies:
-        raise ValueError(
-            f"{spec.source}: history: expected {spec.num_bodies} bodies, got "
-            f"{history.num_bodies}"
-        )
+    check_spec(spec)
+    check_history(spec, history)
     touching = find_touching(spec, history)
     chosen = _choose_block(spec, history, touching, bodies)
     block = make_block(spec, chosen, history, touching=touching)

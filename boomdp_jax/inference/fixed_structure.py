@@ -117,6 +117,24 @@ def fix_structure(
     )
 
 
+def check_structure(
+    specs: Sequence[SceneSpec],
+    method: str,
+    structure: Structure | Bool[np.ndarray, " slot"] | None,
+) -> None:
+    """Raise unless a structure goes with a method of `infer`, and with all scenes.
+
+    Raises:
+        ValueError: a structure where the method finds it, or as in `fix_structure`.
+    """
+    if structure is None:
+        return
+    if method not in ("nuts", "svi"):
+        raise ValueError(f"structure: expected none with method {method!r}")
+    for spec in {id(spec): spec for spec in specs}.values():
+        fix_structure(spec, structure)
+
+
 def structure_blocks(
     spec: SceneSpec,
     history: History,

@@ -20,7 +20,7 @@ from boomdp_jax.inference.block import Block, make_block, stack_blocks
 from boomdp_jax.inference.compile_ahead import signature
 from boomdp_jax.inference.components import independent_blocks
 from boomdp_jax.inference.evidence_report import BlockResult
-from boomdp_jax.inference.fixed_structure import Structure
+from boomdp_jax.inference.fixed_structure import Structure, check_structure
 from boomdp_jax.inference.likelihoods import ChosenLikelihood, choose_likelihood
 from boomdp_jax.inference.nuts import run_nuts
 from boomdp_jax.inference.outliers import outlier_notes, without_isolated
@@ -171,28 +171,25 @@ def infer_batch(
     Raises:
         ValueError: as in `infer`; or not as many histories as scenes.
     """
-    if method not in METHODS:
-        raise ValueError(
-            f"method: expected one of {', '.join(METHODS)}; got {method!r}"
-        )
+    settings, chosen = checked_options(
+        method=method,
+        likelihood=likelihood,
+        horizon=horizon,
+        outliers=outliers,
+        num_chains=num_chains,
+        num_warmup=num_warmup,
+        num_samples=num_samples,
+    )
     check_arguments(key, specs, histories, mesh)
-    num_chains = whole_number("num_chains", num_chains, 1)
-    num_warmup = whole_number("num_warmup", num_warmup, 0)
-    num_samples = whole_number("num_samples", num_samples, 1)
-    if outliers not in OUTLIERS:
-        raise ValueError(
-            f"outliers: expected one of {', '.join(OUTLIERS)}; got {outliers!r}"
-        )
-    if method in ("nuts", "svi") and outliers != "none":
-        raise ValueError(f"outliers: expected none with method {method!r}")
-    if method not in ("nuts", "svi") and structure is not None:
-        raise ValueError(f"structure: expected none with method {method!r}")
-    chosen = choose_likelihood(likelihood, horizon, method=method, outliers=outliers)
+    check_structure(specs, method, structure)
     with spread_over(mesh):
         if method in ("nuts", "svi"):
-            counts = {"num_samples": num_samples, "num_chains": num_chains}
+            counts = {
+                "num_samples": settings.num_samples,
+                "num_chains": settings.num_chains,
+            }
             if method == "nuts":
-                counts["num_warmup"] = num_warmup
+                counts["num_warmup"] = settings.num_warmup
             run = {"nuts": run_nuts, "svi": run_svi}[method]
             missing = [
                 [
@@ -216,7 +213,6 @@ def infer_batch(
                 posteriors.append(_with_notes(found, missing[index]))
         else:
             method = "rj" if method == "auto" else method
-            settings = SampleSettings(num_chains, num_warmup, num_samples)
             posteriors = _infer_structures(
                 key,
                 specs,
@@ -245,6 +241,41 @@ def _with_notes(posterior: Posterior, notes: list[str]) -> Posterior:
         return posterior
     before = posterior.diagnostics.get("notes", [])
     return with_diagnostics(posterior, (), {"notes": [*before, *notes]})
+
+
+def checked_options(
+    *,
+    method: str,
+    likelihood: str,
+    horizon: int | None,
+    outliers: str,
+    num_chains: int,
+    num_warmup: int,
+    num_samples: int,
+) -> tuple[SampleSettings, ChosenLikelihood]:
+    """Counts and likelihood of `infer`, whose options these are.
+
+    Raises:
+        ValueError: as in `infer`.
+    """
+    if method not in METHODS:
+        raise ValueError(
+            f"method: expected one of {', '.join(METHODS)}; got {method!r}"
+        )
+    counts = SampleSettings(
+        whole_number("num_chains", num_chains, 1),
+        whole_number("num_warmup", num_warmup, 0),
+        whole_number("num_samples", num_samples, 1),
+    )
+    if outliers not in OUTLIERS:
+        raise ValueError(
+            f"outliers: expected one of {', '.join(OUTLIERS)}; got {outliers!r}"
+        )
+    if method in ("nuts", "svi") and outliers != "none":
+        raise ValueError(f"outliers: expected none with method {method!r}")
+    return counts, choose_likelihood(
+        likelihood, horizon, method=method, outliers=outliers
+    )
 
 
 def _infer_structures(

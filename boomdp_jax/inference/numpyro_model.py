@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float
 from numpyro.distributions import transforms
 
 from boomdp_jax.core.history import History
+from boomdp_jax.inference.arguments import check_history, check_spec
 from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.contact_prediction import ContactScene, predict_step
 from boomdp_jax.inference.fixed_structure import Structure, structure_blocks
@@ -187,16 +188,14 @@ def make_model(
         The model.
 
     Raises:
+        TypeError: a scene or history that is none.
         ValueError: a structure that the scene does not allow, an unknown kind of
             noise, a history of another number of bodies, or no body that can move.
     """
     if noise not in ("groups", "scalar"):
         raise ValueError(f"noise: expected groups or scalar, got {noise!r}")
-    if history.num_bodies != spec.num_bodies:
-        raise ValueError(
-            f"{spec.source}: history: expected {spec.num_bodies} bodies, got "
-            f"{history.num_bodies}"
-        )
+    check_spec(spec)
+    check_history(spec, history)
     if np.all(spec.is_static):
         raise ValueError(f"{spec.source}: expected a body that can move, got none")
     blocks = structure_blocks(spec, history, structure)

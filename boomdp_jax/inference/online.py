@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import BoolScalar, Key, on_device
+from boomdp_jax.core.checked_input import whole_number
 from boomdp_jax.core.history import History, make_history
 from boomdp_jax.inference.arguments import check_history
 from boomdp_jax.inference.block import Block
@@ -123,16 +124,9 @@ class OnlineBelief:
                 never tied (see `independent_blocks`).
 
         Raises:
+            TypeError: a scene or a screen that is none.
             ValueError: a number out of range; a scene that `infer` refuses.
         """
-        if capacity < LEAVING_SHARE:
-            raise ValueError(
-                f"capacity: expected at least {LEAVING_SHARE}, got {capacity}"
-            )
-        if dt is not None and not 0 < dt < np.inf:
-            raise ValueError(f"dt: expected positive seconds, got {dt}")
-        self.spec, self.capacity = spec, capacity
-        self._dt = float(spec.dt if dt is None else dt)
         self._settings = refit_settings(
             spec,
             num_particles=num_particles,
@@ -141,13 +135,15 @@ class OnlineBelief:
             change_rate=change_rate,
             num_levels=num_noise_levels,
         )
+        self.capacity = whole_number("capacity", capacity, LEAVING_SHARE)
+        self.spec, self._dt = spec, self._settings.step_length(dt)
         none = np.zeros((0, spec.num_bodies, 6))
         history = make_history(none, none[..., :3], none, self._dt, capacity=capacity)
         self._empty = eqx.tree_at(
             lambda h: h.dt, history, on_device(np.full(capacity, self._dt))
         )
         seen = self._empty if screen is None else screen
-        check_history(spec, seen)
+        check_history(spec, seen, "screen")
         self._blocks = [
             make_online_block(self._settings, bodies, self._empty)
             for bodies in independent_blocks(spec, seen)[0]
@@ -336,9 +332,11 @@ class OnlineBelief:
 
         Returns:
             Φ, of equal weight, drawn systematically; leading axis `num_samples`.
+
+        Raises:
+            ValueError: a number of samples that is no whole number or under one.
         """
-        if num_samples < 1:
-            raise ValueError(f"num_samples: expected at least 1, got {num_samples}")
+        num_samples = whole_number("num_samples", num_samples, 1)
         return online_params(key, self.spec, self._parts(belief), num_samples)
 
     def best_params(self, belief: BeliefState) -> Params:

@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from boomdp_jax.core.arrays import Key, on_device
+from boomdp_jax.core.checked_input import real_array, whole_number
 from boomdp_jax.core.history import History
+from boomdp_jax.inference.arguments import check_spec
 from boomdp_jax.inference.block import Block, make_block, stack_blocks
 from boomdp_jax.inference.find_modes import find_modes
 from boomdp_jax.inference.fit import FitSettings
@@ -71,6 +73,17 @@ class RefitSettings(NamedTuple):
     """Of the noise of each structure of a lone body (`noise_levels`)."""
     fit: FitSettings = FitSettings()
 
+    def step_length(self, dt: Any) -> float:
+        """Length of every step [s]; None: the scene's.
+
+        Raises:
+            ValueError: no number, or one that is not positive and finite.
+        """
+        seconds = _one_number("dt", self.spec.dt if dt is None else dt)
+        if not 0 < seconds < np.inf:
+            raise ValueError(f"dt: expected positive seconds, got {dt}")
+        return seconds
+
 
 def refit_settings(
     spec: SceneSpec,
@@ -84,10 +97,15 @@ def refit_settings(
     """Settings, checked; arguments as of `OnlineBelief`.
 
     Raises:
+        TypeError: a scene that is none.
         ValueError: a number out of range, or a scene of which nothing can be learnt
             step by step.
     """
-    if num_particles < _MULTIPLE or num_particles % _MULTIPLE:
+    check_spec(spec)
+    num_particles = whole_number("num_particles", num_particles, _MULTIPLE)
+    forgetting = _one_number("forgetting", forgetting)
+    change_rate = _one_number("change_rate", change_rate)
+    if num_particles % _MULTIPLE:
         raise ValueError(
             f"num_particles: expected a multiple of {_MULTIPLE}, got {num_particles}"
         )
@@ -95,8 +113,7 @@ def refit_settings(
         raise ValueError(f"forgetting: expected in (0, 1], got {forgetting}")
     if not 0.0 <= change_rate < 1.0:
         raise ValueError(f"change_rate: expected in [0, 1), got {change_rate}")
-    if num_levels < 1:
-        raise ValueError(f"num_noise_levels: expected at least 1, got {num_levels}")
+    num_levels = whole_number("num_noise_levels", num_levels, 1)
     if "actuator.delay" in spec.unknown_numbers:
         raise ValueError(
             f"{spec.source}: unknown.actuator: expected no delay in an online belief, "
@@ -106,10 +123,17 @@ def refit_settings(
         spec=spec,
         num_particles=num_particles,
         is_uniform=is_uniform,
-        forgetting=float(forgetting),
-        change_rate=float(change_rate),
-        num_levels=int(num_levels),
+        forgetting=forgetting,
+        change_rate=change_rate,
+        num_levels=num_levels,
     )
+
+
+def _one_number(name: str, value: Any) -> float:
+    array = real_array(name, value)
+    if array.ndim:
+        raise ValueError(f"{name}: expected one number, got shape {array.shape}")
+    return float(array)
 
 
 def make_online_block(

@@ -22,20 +22,26 @@ import jax
 import numpy as np
 
 from boomdp_jax.core.arrays import Key, on_device
+from boomdp_jax.core.checked_input import whole_number
 from boomdp_jax.core.history import History
 from boomdp_jax.core.history_file import load_history
 from boomdp_jax.core.json_file import check_same, read_json, write_json
 from boomdp_jax.core.versions import library_versions
-from boomdp_jax.inference.fixed_structure import Structure
-from boomdp_jax.inference.infer import METHODS, OUTLIERS, infer_batch, seed_of
-from boomdp_jax.inference.likelihoods import choose_likelihood
+from boomdp_jax.inference.arguments import check_key
+from boomdp_jax.inference.fixed_structure import Structure, check_structure
+from boomdp_jax.inference.infer import checked_options, infer_batch, seed_of
+from boomdp_jax.inference.sweep_arguments import (
+    Recording,
+    check_files,
+    checked_num_rows,
+    checked_shard,
+    listed,
+    structure_for_file,
+)
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 SCHEMA = "boomdp-sweep-1"
 UNIT_SCHEMA = "boomdp-sweep-unit-1"
-
-Recording = History | str | os.PathLike
-"""Of one object: itself, or its file."""
 
 _MANIFEST = "sweep.json"
 # Fewest rows that a history is padded to.
@@ -69,7 +75,8 @@ def infer_sweep(
         shard: (i, n): do units i, i + n, i + 2 n and so on.
         batch: objects of one unit, inferred in one compiled call.
         resume: whether units of this shard may be there already.
-        num_rows: how many rows of each file to use, from the first; default: all.
+        num_rows: how many rows of each file to use, from the first; default: all. Not
+            for recordings in memory.
         progress: show stages on standard error.
         **options: `method`, `structure`, `likelihood`, `horizon`, `outliers`,
             `num_chains`, `num_warmup` and `num_samples`, as `infer_batch` takes them.
@@ -78,12 +85,20 @@ def infer_sweep(
         The files of this shard's objects, in order.
 
     Raises:
+        TypeError: a key, scenes or recordings that are none.
         ValueError: a folder that was begun with something else, a shard that does not
             exist, or as in `infer_batch`.
         OSError: a file cannot be read or written.
     """
     sweep = begin_sweep(
-        key, specs, histories, out_dir, batch=batch, num_rows=num_rows, **options
+        key,
+        specs,
+        histories,
+        out_dir,
+        shard=shard,
+        batch=batch,
+        num_rows=num_rows,
+        **options,
     )
     units = sweep.units(shard)
     if not resume:
@@ -99,6 +114,7 @@ def begin_sweep(
     histories: Recording | Sequence[Recording],
     out_dir: str | os.PathLike,
     *,
+    shard: tuple[int, int] = (0, 1),
     batch: int = 16,
     num_rows: int | None = None,
     method: str = "auto",
@@ -112,11 +128,15 @@ def begin_sweep(
 ) -> "Sweep":
     """Make or reopen the folder of a sweep, whose units can then be run one by one.
 
+    Arguments are checked first: a folder that was begun with a mistake would refuse
+    what was meant.
+
     Args:
         key: as in `infer_sweep`, as are all others.
         specs: one scene for all, or one for each history.
         histories: recordings, or files, or a single one.
         out_dir: folder to write to.
+        shard: the files of its recordings must be there; default: all.
         batch: objects of one unit.
         num_rows: how many rows of each file to use.
         method: as in `infer_batch`.
@@ -132,53 +152,50 @@ def begin_sweep(
         The sweep; nothing of it has been run yet.
 
     Raises:
+        TypeError: a key, scenes or recordings that are none.
         ValueError: a folder that was begun with something else, or arguments that make
             no sense.
-        OSError: the folder cannot be made.
+        OSError: a recording cannot be opened, or the folder not be made.
     """
-    if method not in METHODS:
-        raise ValueError(
-            f"method: expected one of {', '.join(METHODS)}; got {method!r}"
-        )
-    if outliers not in OUTLIERS:
-        raise ValueError(
-            f"outliers: expected one of {', '.join(OUTLIERS)}; got {outliers!r}"
-        )
-    choose_likelihood(likelihood, horizon, method=method, outliers=outliers)
-    if batch < 1:
-        raise ValueError(f"batch: expected at least 1, got {batch}")
-    if isinstance(histories, History | str | os.PathLike):
-        histories = [histories]
-    if not histories:
-        raise ValueError("histories: expected at least one, got none")
-    if isinstance(specs, SceneSpec):
-        specs = [specs] * len(histories)
-    if len(specs) != len(histories):
-        raise ValueError(
-            f"histories: expected one per scene, {len(specs)}, got {len(histories)}"
-        )
+    counts, _ = checked_options(
+        method=method,
+        likelihood=likelihood,
+        horizon=horizon,
+        outliers=outliers,
+        num_chains=num_chains,
+        num_warmup=num_warmup,
+        num_samples=num_samples,
+    )
+    check_key(key)
+    batch = whole_number("batch", batch, 1)
+    specs, histories = listed(specs, histories)
     options = {
         "method": method,
-        "structure": None if structure is None else dict(structure),
+        "structure": structure_for_file(structure),
         "likelihood": likelihood,
-        "horizon": horizon,
+        "horizon": None if horizon is None else int(horizon),
         "outliers": outliers,
-        "num_chains": num_chains,
-        "num_warmup": num_warmup,
-        "num_samples": num_samples,
+        "num_chains": counts.num_chains,
+        "num_warmup": counts.num_warmup,
+        "num_samples": counts.num_samples,
     }
     words = np.asarray(jax.random.key_data(key)).ravel()
     sweep = Sweep(
         folder=Path(out_dir),
-        specs=tuple(specs),
-        histories=tuple(histories),
+        specs=specs,
+        histories=histories,
         words=tuple(int(word) for word in words),
         batch=batch,
-        num_rows=num_rows,
+        num_rows=checked_num_rows(num_rows, histories),
         options=options,
     )
-    sweep.folder.mkdir(exist_ok=True)
     path = sweep.folder / _MANIFEST
+    if path.exists():
+        sweep.check_folder()
+    check_structure(specs, method, structure)
+    for unit in sweep.units(shard):
+        check_files([histories[number] for number in sweep.objects(unit)])
+    sweep.folder.mkdir(exist_ok=True)
     if not path.exists():
         write_json(path, sweep.manifest())
     sweep.check_folder()
@@ -212,9 +229,7 @@ class Sweep:
 
     def units(self, shard: tuple[int, int] = (0, 1)) -> range:
         """Numbers of the units of a shard (i, n): i, i + n, i + 2 n and so on."""
-        place, num = shard
-        if not 0 <= place < num:
-            raise ValueError(f"shard: expected (i, n) with 0 <= i < n, got {shard}")
+        place, num = checked_shard(shard)
         return range(place, self.num_units, num)
 
     def objects(self, unit: int) -> range:

@@ -6,6 +6,7 @@ import pytest
 from numpyro.infer import MCMC
 
 from boomdp_jax.inference.fitted_kernel import structure_kernel
+from boomdp_jax.inference.numpyro_model import make_model
 from tests.inference.test_numpyro_model import make_spec, pushed
 
 
@@ -49,3 +50,14 @@ def test_one_of_several_blocks_has_to_be_chosen():
         structure_kernel(jax.random.key(0), spec, history, bodies=["lamp"])
     with pytest.raises(ValueError, match="expected 1 bodies, got 2"):
         structure_kernel(jax.random.key(0), make_spec(), history)
+
+
+@pytest.mark.parametrize("history", [None, "x", np.zeros((2, 1, 6))])
+def test_a_history_or_scene_that_is_none_is_refused(no_type_checks, history):
+    """By the model of one structure too."""
+    spec, key = make_spec(), jax.random.key(0)
+    for call in (structure_kernel, lambda _, *arguments: make_model(*arguments)):
+        with pytest.raises(TypeError, match=r"^history: expected a History, .*; got "):
+            call(key, spec, history)
+        with pytest.raises(TypeError, match=r"^spec: expected a SceneSpec, .*; got "):
+            call(key, "room.json", history)

@@ -304,6 +304,36 @@ def test_settings_out_of_range_are_refused(options, message):
         OnlineBelief(box_world([], is_hidden=True), **options)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"capacity": "64"}, "capacity: expected a whole number, at least 8, got '64'"),
+        ({"num_particles": 64.0}, "num_particles: expected a whole number, .* 64.0"),
+        (
+            {"num_noise_levels": 2.7},
+            "num_noise_levels: expected a whole number, .* 2.7",
+        ),
+        ({"forgetting": "a"}, "forgetting: expected real numbers, got"),
+        ({"forgetting": [0.5, 1.0]}, "forgetting: expected one number, got shape"),
+        ({"change_rate": None}, "change_rate: expected real numbers, got"),
+        ({"dt": "a"}, "dt: expected real numbers, got"),
+        ({"screen": "x"}, "screen: expected a History, .*; got str"),
+        ({"spec": {}}, "spec: expected a SceneSpec, .*; got dict"),
+        ({"spec": None}, "spec: expected a SceneSpec, .*; got None"),
+    ],
+)
+def test_settings_of_another_type_are_refused(no_type_checks, options, message):
+    with pytest.raises((TypeError, ValueError), match=f"^{message}"):
+        OnlineBelief(**({"spec": box_world([], is_hidden=True)} | options))
+
+
+def test_a_number_of_hypotheses_is_whole(no_type_checks):
+    online = OnlineBelief(box_world([], is_hidden=True), capacity=8, num_particles=16)
+    for wrong in (2.5, 0, True):
+        with pytest.raises(ValueError, match="num_samples: expected"):
+            online.sample_params(jax.random.key(0), None, wrong)
+
+
 def test_histories_that_do_not_fit_are_refused():
     belief = OnlineBelief(box_world([], is_hidden=True), capacity=8)
     assert belief.blocks == [("box",)]

@@ -15,12 +15,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from boomdp_jax.core import save_history
+from boomdp_jax.core import make_history, save_history
 from boomdp_jax.core.json_file import read_json
 from boomdp_jax.core.npz_file import read_npz
 from boomdp_jax.inference import sweep as sweeps
 from boomdp_jax.inference.posterior import Posterior, load_posterior
 from boomdp_jax.inference.sweep import begin_sweep, infer_sweep, roomy
+from boomdp_jax.inference.sweep_arguments import (
+    checked_num_rows,
+    checked_shard,
+    listed,
+    structure_for_file,
+)
 from tests.inference.posteriors import table_posterior, table_spec
 from tests.inference.recordings import box_scene, free_box
 from tests.inference.sweep_program import NUM_OBJECTS
@@ -237,6 +243,91 @@ def test_bad_arguments_leave_no_folder(tmp_path: Path, changes, message: str):
     with pytest.raises(ValueError, match=message):
         begin(tmp_path / "out", **changes)
     assert not (tmp_path / "out").exists()
+
+
+BAD_OPTIONS = [
+    ({"num_samples": 0}, "num_samples: expected at least 1, got 0"),
+    ({"num_chains": 1.5}, "num_chains: expected a whole number, at least 1, got 1.5"),
+    ({"num_warmup": -1}, "num_warmup: expected at least 0, got -1"),
+    ({"batch": 2.5}, "batch: expected a whole number, at least 1, got 2.5"),
+    ({"structure": {"table": []}}, "structure: expected none with method 'auto'"),
+    ({"method": "nuts", "structure": {"chair": []}}, "expected a body that can move"),
+    ({"method": "svi", "outliers": "student-t"}, "outliers: expected none with"),
+    ({"num_rows": 3}, "num_rows: of files: expected None .* got 3"),
+    ({"histories": ["no.npz"]}, r"No such file or directory: 'no\.npz'"),
+    ({"shard": (2, 2)}, r"shard: expected \(i, n\) .* got \(2, 2\)"),
+    ({"shard": 3}, r"shard: expected \(i, n\) with 0 <= i < n, got 3"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), BAD_OPTIONS)
+def test_a_mistake_leaves_no_folder_that_refuses_what_was_meant(
+    tmp_path: Path, no_type_checks, changes, message: str
+):
+    options = {
+        "key": jax.random.key(KEY),
+        "specs": table_spec(),
+        "histories": recordings(),
+        "out_dir": tmp_path / "out",
+    }
+    with pytest.raises((ValueError, OSError), match=message):
+        infer_sweep(**(options | changes))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("specs", "histories", "message"),
+    [
+        (
+            "room.json",
+            ["a.npz"],
+            "specs: expected a SceneSpec or a list of them; .*str",
+        ),
+        ({"a": 1}, ["a.npz"], "specs: expected a SceneSpec or a list of them; .*dict"),
+        ([{"a": 1}], ["a.npz"], "specs: object 0: expected a SceneSpec, .*; got dict"),
+        (None, [np.zeros(3)], "histories: object 0: expected a History or .* ndarray"),
+        (None, ["a.npz", None], "histories: object 1: expected a History or .* None"),
+        (None, np.zeros(3), "histories: expected a History or .*; got ndarray"),
+        (None, iter(["a.npz"]), "histories: expected a History or .* a list of them"),
+    ],
+)
+def test_scenes_and_recordings_that_are_none_are_refused(specs, histories, message):
+    with pytest.raises(TypeError, match=message):
+        listed(table_spec() if specs is None else specs, histories)
+
+
+@pytest.mark.parametrize("shard", [3, (0.0, 1.0), (0, 1, 2), "01", (False, 1), None])
+def test_a_shard_that_is_no_pair_of_whole_numbers_is_refused(shard):
+    with pytest.raises(ValueError, match=r"shard: expected \(i, n\) with 0 <= i < n"):
+        checked_shard(shard)
+
+
+def test_rows_and_structures_are_read_as_what_they_should_be():
+    assert checked_num_rows(np.int64(3), ["a.npz"]) == 3
+    with pytest.raises(ValueError, match=r"num_rows: expected a whole number, .* 2\.5"):
+        checked_num_rows(2.5, ["a.npz"])
+    with pytest.raises(TypeError, match=r"structure: expected a mapping .*; got str"):
+        structure_for_file("wheel")
+
+
+def test_a_recording_of_other_bodies_leaves_no_folder(tmp_path: Path):
+    (one,) = recordings(1)
+    state, action = (np.repeat(np.asarray(x), 2, 1) for x in (one.state, one.action))
+    two = make_history(state, action, state, 0.02)
+    with pytest.raises(ValueError, match="history: expected 1 bodies, got 2"):
+        begin(tmp_path / "out", [one, two])
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_shard_needs_no_files_of_others(tmp_path: Path, cheap: list):
+    path = tmp_path / "0.npz"
+    save_history(path, recordings(1)[0])
+    files, key = [path, tmp_path / "1.npz"], jax.random.key(KEY)
+    folder, options = tmp_path / "out", {"batch": 1, "num_rows": 3}
+    infer_sweep(key, table_spec(), files, folder, shard=(0, 2), **options)
+    assert cheap == [1]
+    with pytest.raises(FileNotFoundError, match=r"1\.npz"):
+        infer_sweep(key, table_spec(), files, folder, shard=(1, 2), **options)
 
 
 def test_a_file_that_is_no_manifest_is_refused(tmp_path: Path):
