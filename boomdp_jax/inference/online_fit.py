@@ -102,7 +102,7 @@ def refit_settings(
             step by step.
     """
     check_spec(spec)
-    num_particles = whole_number("num_particles", num_particles, _MULTIPLE)
+    num_particles = whole_number("num_particles", num_particles, 1)
     forgetting = _one_number("forgetting", forgetting)
     change_rate = _one_number("change_rate", change_rate)
     if num_particles % _MULTIPLE:
