@@ -200,6 +200,6 @@ def add_ground(
         )
         ET.SubElement(actuators, "general", law)
     return [
-        f"{name}: friction of what slides is within 6 % in size, and up to 22.5 "
-        "degrees off its direction"
+        f"{name}: the limit of a foot depends on direction, by up to 6 %, and friction "
+        "of what slides is up to 22.5 degrees off its direction"
     ]
