@@ -73,6 +73,38 @@ def real_array(name: str, values: Any) -> np.ndarray:
     return np.asarray(array, float)
 
 
+def one_number(name: str, value: Any) -> float:
+    """Read a single real number.
+
+    Args:
+        name: of the argument, for the message.
+        value: what was given.
+
+    Raises:
+        ValueError: no number, or several.
+    """
+    array = real_array(name, value)
+    if array.ndim:
+        raise ValueError(f"{name}: expected one number, got shape {array.shape}")
+    return float(array)
+
+
+def positive_seconds(name: str, value: Any) -> float:
+    """Read a length of time.
+
+    Args:
+        name: of the argument, for the message.
+        value: what was given.
+
+    Raises:
+        ValueError: no single number, or one that is not positive and finite.
+    """
+    seconds = one_number(name, value)
+    if not 0.0 < seconds < np.inf:
+        raise ValueError(f"{name}: expected positive seconds, got {value}")
+    return seconds
+
+
 def reading_scale(name: str, values: Any) -> Float[np.ndarray, "4"]:
     """Read standard deviations of position, angle, velocity and spin.
 

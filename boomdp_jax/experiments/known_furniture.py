@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from boomdp_jax.agents.episode import read_state
+from boomdp_jax.agents.episode import read_state, scale_of_readings
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.envs.environment import EnvParams
 from boomdp_jax.envs.furniture import PIECES, Piece
@@ -121,7 +121,7 @@ def _learnt(
     spec = task.pieces[body]
     truth = jax.tree.map(lambda leaf: leaf[body], task.lone_params(params.physics))
     push_key, noise_key, fit_key = jax.random.split(key, 3)
-    scale = jnp.zeros(4) if reading_noise is None else jnp.asarray(reading_noise)
+    scale = scale_of_readings(reading_noise)
     wrenches = task.piece_actions[body][:-1, None]
     pushes = jax.random.randint(push_key, (_NUM_PUSHES,), 0, len(wrenches))
     scene = spec.scene

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from boomdp_jax.agents.episode import read_state
+from boomdp_jax.agents.episode import read_state, scale_of_readings
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.core.history import make_history
 from boomdp_jax.envs.environment import AbstractEnvironment, EnvParams
@@ -84,7 +84,7 @@ def unbiased_samples(
     Returns:
         The samples, in random order.
     """
-    scale = jnp.zeros(4) if reading_noise is None else jnp.asarray(reading_noise)
+    scale = scale_of_readings(reading_noise)
     key, order_key = jax.random.split(key)
     num_each = -(-max(num_samples, NUM_SAMPLES) // _NUM_ROLLOUTS)
     sample = jax.jit(functools.partial(_rollout, task, num_each=num_each))

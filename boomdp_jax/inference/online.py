@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import BoolScalar, Key, on_device
-from boomdp_jax.core.checked_input import whole_number
+from boomdp_jax.core.checked_input import positive_seconds, whole_number
 from boomdp_jax.core.history import History, make_history
 from boomdp_jax.inference.arguments import check_history
 from boomdp_jax.inference.block import Block
@@ -136,7 +136,8 @@ class OnlineBelief:
             num_levels=num_noise_levels,
         )
         self.capacity = whole_number("capacity", capacity, LEAVING_SHARE)
-        self.spec, self._dt = spec, self._settings.step_length(dt)
+        self.spec = spec
+        self._dt = positive_seconds("dt", spec.dt if dt is None else dt)
         none = np.zeros((0, spec.num_bodies, 6))
         history = make_history(none, none[..., :3], none, self._dt, capacity=capacity)
         self._empty = eqx.tree_at(

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from boomdp_jax.core.arrays import Key, on_device
-from boomdp_jax.core.checked_input import real_array, whole_number
+from boomdp_jax.core.checked_input import one_number, whole_number
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.arguments import check_spec
 from boomdp_jax.inference.block import Block, make_block, stack_blocks
@@ -73,17 +73,6 @@ class RefitSettings(NamedTuple):
     """Of the noise of each structure of a lone body (`noise_levels`)."""
     fit: FitSettings = FitSettings()
 
-    def step_length(self, dt: Any) -> float:
-        """Length of every step [s]; None: the scene's.
-
-        Raises:
-            ValueError: no number, or one that is not positive and finite.
-        """
-        seconds = _one_number("dt", self.spec.dt if dt is None else dt)
-        if not 0 < seconds < np.inf:
-            raise ValueError(f"dt: expected positive seconds, got {dt}")
-        return seconds
-
 
 def refit_settings(
     spec: SceneSpec,
@@ -103,8 +92,8 @@ def refit_settings(
     """
     check_spec(spec)
     num_particles = whole_number("num_particles", num_particles, 1)
-    forgetting = _one_number("forgetting", forgetting)
-    change_rate = _one_number("change_rate", change_rate)
+    forgetting = one_number("forgetting", forgetting)
+    change_rate = one_number("change_rate", change_rate)
     if num_particles % _MULTIPLE:
         raise ValueError(
             f"num_particles: expected a multiple of {_MULTIPLE}, got {num_particles}"
@@ -127,13 +116,6 @@ def refit_settings(
         change_rate=change_rate,
         num_levels=num_levels,
     )
-
-
-def _one_number(name: str, value: Any) -> float:
-    array = real_array(name, value)
-    if array.ndim:
-        raise ValueError(f"{name}: expected one number, got shape {array.shape}")
-    return float(array)
 
 
 def make_online_block(

@@ -1,6 +1,5 @@
 """The table of an online belief: a new row at its end, old ones off its front."""
 
-import math
 from typing import Any, NamedTuple
 
 import jax
@@ -9,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar
+from boomdp_jax.core.checked_input import positive_seconds
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.track_data import TrackData, TrackRow
 
@@ -50,9 +50,7 @@ def step_length(dt: Any, usual: float, *, is_uniform: bool) -> Array:
         )
     if dt is None or isinstance(dt, jax.core.Tracer):
         return jnp.asarray(usual if dt is None else dt, float)
-    if not 0 < float(dt) < math.inf:
-        raise ValueError(f"dt: expected positive seconds, got {dt}")
-    return jnp.asarray(dt, float)
+    return jnp.asarray(positive_seconds("dt", dt), float)
 
 
 def new_row(

@@ -198,6 +198,7 @@ def begin_sweep(
     sweep.folder.mkdir(exist_ok=True)
     if not path.exists():
         write_json(path, sweep.manifest())
+    # Another shard may have begun it meanwhile.
     sweep.check_folder()
     return sweep
 
