@@ -50,17 +50,18 @@ def by_vmap(*arguments, body, passed):
 def by_reduction(*arguments, body, passed):
     """The same by functions of windowed reductions, given and returning the same."""
     shape, values, out = common_shape(arguments), list(arguments), []
+    # One mark that it should not be merged is enough for all parts.
+    is_marked = int(np.prod(shape)) < _MANY
     for part in _parts(body):
-        out = _reduction(
-            part.function, [values[i] for i in part.inputs], part.num_outputs
-        )
-        values += out
+        inputs = [values[i] for i in part.inputs]
+        out = _reduction(part.function, inputs, part.num_outputs, not is_marked)
+        is_marked, values = True, values + out
     # A result that depends on scalars alone is one.
     results = [jnp.broadcast_to(leaf, shape) for leaf in out]
     return results + [arguments[i] for i in passed]
 
 
-def _reduction(function, arguments: list, num_out: int) -> list:
+def _reduction(function, arguments: list, num_out: int, is_unmerged: bool) -> list:
     """A function of a windowed reduction; scalars travel as initial values."""
     shape, dtype = common_shape(arguments), arguments[0].dtype
     is_array = [bool(a.shape) for a in arguments]
@@ -70,7 +71,7 @@ def _reduction(function, arguments: list, num_out: int) -> list:
     arrays = [a.reshape(flat) for a in arguments if a.shape]
     scalars = [a for a in arguments if not a.shape]
     num_slots = max(len(arrays), len(scalars), num_out)
-    if int(np.prod(shape)) >= _MANY:
+    if is_unmerged:
         # A number more that nobody looks at.
         scalars.append(one_by_sorting(sum(a.reshape(-1)[0] for a in arrays)))
         num_slots = max(num_slots, len(scalars))

@@ -31,6 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.interpreters import ad, batching, mlir
 
+from boomdp_jax.core.dependence import depends_on
 from boomdp_jax.core.loop_code import (
     by_reduction,
     by_vmap,
@@ -249,8 +250,8 @@ batching.primitive_batchers[_one_loop_p] = _batched
 
 @functools.lru_cache(maxsize=256)
 def _tangent(body: _Body, active: tuple[int, ...]) -> _Body:
-    """From arguments and tangents of the active ones to tangents of the results."""
-    dtypes = body.dtypes
+    """From arguments and tangents of the active ones to tangents of moving results."""
+    dtypes, moving = body.dtypes, _moving_results(body, active)
 
     def tangent(*values):
         primals, rates = list(values[: len(dtypes)]), list(values[len(dtypes) :])
@@ -261,7 +262,8 @@ def _tangent(body: _Body, active: tuple[int, ...]) -> _Body:
                 full[i] = value
             return body.function(*full)
 
-        return jax.jvp(of_active, [primals[i] for i in active], rates)[1]
+        out = jax.jvp(of_active, [primals[i] for i in active], rates)[1]
+        return [rate for rate, is_moving in zip(out, moving, strict=True) if is_moving]
 
     jaxpr = _jaxpr_of(tangent, dtypes + [dtypes[i] for i in active])
     return _Body(jaxpr, num_linear=len(active))
@@ -298,6 +300,13 @@ def _transposed(
     return _Body(_jaxpr_of(transposed, dtypes_in), len(given) + len(added))
 
 
+@functools.lru_cache(maxsize=256)
+def _moving_results(body: _Body, active: tuple[int, ...]) -> tuple[bool, ...]:
+    """Which results have a derivative by the active arguments."""
+    num = len(body.jaxpr.in_avals)
+    return depends_on(body.jaxpr.jaxpr, [i in active for i in range(num)])
+
+
 def _jvp(primals, tangents, *, body, passed):
     out = _one_loop_p.bind(*primals, body=body, passed=passed)
     num_results = len(out) - len(passed)
@@ -311,19 +320,26 @@ def _jvp(primals, tangents, *, body, passed):
         ]
         arguments, tangent = [*primals[:first], *rates], body
         places = {i: i for i in active}
+        moving = list(range(num_results))
     else:
         rates = [tangents[i] for i in active]
         arguments, tangent = [*primals, *rates], _tangent(body, active)
         places = {i: len(primals) + k for k, i in enumerate(active)}
-    moving = [k for k, i in enumerate(passed) if i in places]
-    passed_on = tuple(places[passed[k]] for k in moving)
+        is_moving = _moving_results(body, active)
+        moving = [i for i in range(num_results) if is_moving[i]]
+    handed_on = [k for k, i in enumerate(passed) if i in places]
+    rates_out: list = [ad.Zero(jax.typeof(o).to_tangent_aval()) for o in out]
+    if not moving:
+        for k in handed_on:
+            rates_out[num_results + k] = tangents[passed[k]]
+        return out, rates_out
+    passed_on = tuple(places[passed[k]] for k in handed_on)
     moved = _one_loop_p.bind(*arguments, body=tangent, passed=passed_on)
     # Tangents of a batch's scalars may be scalars still.
-    rates_out: list = [ad.Zero(jax.typeof(o).to_tangent_aval()) for o in out]
-    for i, m in enumerate(moved[:num_results]):
+    for i, m in zip(moving, moved[: len(moving)], strict=True):
         shape = out[i].shape
         rates_out[i] = m if m.shape == shape else jnp.broadcast_to(m, shape)
-    for k, m in zip(moving, moved[num_results:], strict=True):
+    for k, m in zip(handed_on, moved[len(moving) :], strict=True):
         rates_out[num_results + k] = m
     return out, rates_out
 

@@ -26,7 +26,6 @@ import jax
 import jax.numpy as jnp
 
 from boomdp_jax.core.arrays import FloatScalar
-from boomdp_jax.core.holding import hold, runtime_one
 from boomdp_jax.physics.friction import Contact, Spin
 from boomdp_jax.physics.implicit_fit import Groups
 from boomdp_jax.physics.lone_contacts import Feet, Pair, Track, into, turned
@@ -111,14 +110,9 @@ def lone_body(
         pins: none or one.
 
     Returns:
-        All that the time loop needs, each number computed once.
+        All that the time loop needs.
     """
     zero, pivot, ease = jnp.zeros_like(mass), None, mobile / mass
-    one = runtime_one(mass)
-
-    def held(values):
-        return jax.tree.map(lambda leaf: hold(leaf, one), values)
-
     axis = None
     if groups.num_wheels:
         assert contacts is not None
@@ -131,15 +125,13 @@ def lone_body(
         turned_anchor = into(axis, *anchor)
         square = anchor[0] ** 2 + anchor[1] ** 2
         levelling = on * mass / (mass * square + inertia)
-        pivot = held(
-            Pivot(
-                active=pin.active,
-                anchor=turned_anchor,
-                world=pin.anchor_b,
-                place=(on * pin.anchor_b[0], on * pin.anchor_b[1]),
-                free=1.0 - on,
-                levelling=levelling,
-            )
+        pivot = Pivot(
+            active=pin.active,
+            anchor=turned_anchor,
+            world=pin.anchor_b,
+            place=(on * pin.anchor_b[0], on * pin.anchor_b[1]),
+            free=1.0 - on,
+            levelling=levelling,
         )
         ease = (1.0 - on) * ease
     parts = [] if contacts is None else _parts(contacts)
@@ -153,7 +145,6 @@ def lone_body(
         for first in range(num_wheels, len(parts), groups.num_feet)
     ]
     brakes = [Brake(*spin) for spin in ([] if spins is None else _parts(spins))]
-    tracks, feet, brakes = held((tracks, feet, brakes))
     floor = brakes[: len(brakes) - len(pins)]
     aid = grip(brakes[-1]) if pins else None
     if len(parts) > 1 or floor:
@@ -161,16 +152,16 @@ def lone_body(
     return LoneBody(
         length=length,
         mobile=mobile,
-        mass=held(mass),
-        inertia=held(inertia),
-        weight=held(weight),
+        mass=mass,
+        inertia=inertia,
+        weight=weight,
         facing=facing,
-        ease=held(ease),
+        ease=ease,
         tracks=tracks,
         feet=feet,
         brakes=floor,
         joint=brakes[-1] if pins else None,
-        aid=held(jax.lax.stop_gradient(aid)),
+        aid=jax.lax.stop_gradient(aid),
         pivot=pivot,
     )
 

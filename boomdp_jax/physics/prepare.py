@@ -1,13 +1,16 @@
 """What depends on scene, params and step length alone, out of the time loop."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import FloatScalar
 from boomdp_jax.core.holding import hold, runtime_one
+from boomdp_jax.core.written_out import one_loop_of_arrays
 from boomdp_jax.physics.friction import (
     KNEE_SPEED,
     Contact,
@@ -121,7 +124,24 @@ def prepare_lone(
     rail = rail_of(params)
     if rail is not None:
         scene, params = rail_params(scene, params)
-    bodies, groups = prepare_bodies(scene, params, length)
+    numbers = one_loop_of_arrays(_lone_numbers, *_told(scene, params), length)
+    mobile = 1.0 - scene.is_static[0].astype(scene.area.dtype)
+    return LoneBody(length / scene.num_substeps, mobile, *numbers), rail
+
+
+def _told(scene: Scene, params: Params) -> tuple[Scene, Params]:
+    """Numbers and truth values of both, without the corners, which do not count."""
+    seen = eqx.tree_at(lambda s: (s.vertices, s.vertex_mask), scene, (None, None))
+
+    def is_told(leaf: Array) -> bool:
+        return not jnp.issubdtype(leaf.dtype, jnp.integer)
+
+    return eqx.filter((seen, params), is_told)
+
+
+def _lone_numbers(scene: Scene, params: Params, length: FloatScalar) -> tuple:
+    """A lone body's numbers, but for the first two, the same for all hypotheses."""
+    bodies, groups = prepare_bodies(scene, params, length, lambda values: values)
     facing = jnp.zeros_like(bodies.mass)
     if groups.num_wheels:
         facing = wheel_headings(params.wheel)[0, 0]
@@ -137,7 +157,7 @@ def prepare_lone(
         bodies.spins,
         _pins(params.revolute, bodies.mass.dtype),
     )
-    return body, rail
+    return tuple(body)[2:]
 
 
 def prepare_world(
@@ -155,7 +175,15 @@ def prepare_world(
     """
 
     def of_one(scene, params, length):
-        return prepare_bodies(scene, params, length)[0]
+        one = runtime_one(scene.area[0])
+
+        def held(values):
+            # Else the compiler works all of this out again for whatever reads it.
+            return jax.tree.map(
+                lambda leaf: hold(leaf, jnp.broadcast_to(one, leaf.shape)), values
+            )
+
+        return prepare_bodies(scene, params, length, held)[0]
 
     bodies = jax.vmap(of_one, in_axes=-1, out_axes=-1)(scene, params, length)
     length = bodies.length
@@ -175,7 +203,7 @@ def prepare_world(
 
 
 def prepare_bodies(
-    scene: Scene, params: Params, length: FloatScalar
+    scene: Scene, params: Params, length: FloatScalar, keep: Callable[[Any], Any]
 ) -> tuple[Bodies, Groups]:
     """Masses, frictions with impulses in place of forces, and their blend weights.
 
@@ -183,6 +211,7 @@ def prepare_bodies(
         scene: outlines, feet, gravity; not in lanes.
         params: one hypothesis.
         length: of a step [s].
+        keep: done to what several others use.
 
     Returns:
         What is of each body, and which points of friction belong together. Of a lone
@@ -209,17 +238,9 @@ def prepare_bodies(
             else jax.tree.map(lambda *parts: jnp.concatenate(parts), spins, joints)
         )
     inverse = _mobility(pins, mass, inertia)
-    one = runtime_one(mass)
-
-    def held(values):
-        # Else the compiler works all of this out again for whatever reads it.
-        return jax.tree.map(
-            lambda leaf: hold(leaf, jnp.broadcast_to(one, leaf.shape)), values
-        )
-
     groups = contact_groups(scene, params)
-    contacts, spins, inverse = held((contacts, spins, inverse))
-    contacts, spins = held(
+    contacts, spins, inverse = keep((contacts, spins, inverse))
+    contacts, spins = keep(
         fit_weights(groups, contacts, spins, inverse, mass, inertia, mobile, length)
     )
     weight = (length * mass * scene.gravity[0], length * mass * scene.gravity[1])
