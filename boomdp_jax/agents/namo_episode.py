@@ -125,6 +125,7 @@ class _Episode:
         self._compiled: Future | None = _COMPILER.submit(
             drive, key, self.world, self.state, nothing
         )
+        belief.warm_up()
 
     @property
     def robot(self) -> np.ndarray:

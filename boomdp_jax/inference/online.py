@@ -44,8 +44,9 @@ from boomdp_jax.inference.online_refit import (
     refit_block,
 )
 from boomdp_jax.inference.online_refresh import LEAVING_SHARE, OnlineInfo, refresh
-from boomdp_jax.inference.online_rows import step_length
+from boomdp_jax.inference.online_rows import step_length, table_of
 from boomdp_jax.inference.online_state import BeliefState, BlockBelief
+from boomdp_jax.inference.online_warm_up import try_out
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.physics.arguments import checked_state, checked_wrench
 from boomdp_jax.physics.params import Params
@@ -198,7 +199,9 @@ class OnlineBelief:
         )
         if history is None:
             return state
-        table = self._checked(history)
+        check_history(self.spec, history)
+        dt = self._dt if self._settings.is_uniform else None
+        table = table_of(self._empty, history, dt)
         if (num_rows := int(table.num_transitions)) == 0:
             return state
         state = eqx.tree_at(
@@ -318,6 +321,25 @@ class OnlineBelief:
         )
         return belief, RefitInfo(tuple(found), time.perf_counter() - start)
 
+    def warm_up(self, num_rows: int | None = None) -> None:
+        """Compile what steps, refits and draws need; a minute or two, once a process.
+
+        For who cannot wait for it when the first transition comes. It may be called on
+        a thread of its own; nothing that follows depends on it but its time.
+
+        Args:
+            num_rows: of tables up to which refits are compiled; default: the capacity.
+
+        Raises:
+            ValueError: a number of rows under one.
+        """
+        most = self.capacity if num_rows is None else num_rows
+        most = whole_number("num_rows", most, 1)
+        targets = [block.target for block in self._blocks]
+        sizes = self.capacity, self._settings.num_particles, self._settings.num_levels
+        name = signature(targets), self._step, sizes
+        try_out(self, name, None if self._settings.is_uniform else self._dt, most)
+
     def posterior(self, belief: BeliefState) -> Posterior:
         """Weighted draws: particles of one block, those of several paired at random."""
         key = jax.random.fold_in(belief.key, 1)
@@ -367,28 +389,3 @@ class OnlineBelief:
             )
             for group in self._groups
         )
-
-    def _checked(self, history: History) -> History:
-        """A history's rows in a table of the belief's capacity."""
-        check_history(self.spec, history)
-        mask = np.asarray(history.mask)
-        num_rows = int(mask.sum())
-        if num_rows > self.capacity:
-            raise ValueError(
-                f"history: expected at most {self.capacity} transitions, the capacity; "
-                f"got {num_rows}"
-            )
-        dt = np.asarray(history.dt, float)[mask]
-        if self._settings.is_uniform and not np.allclose(dt, self._dt, rtol=1e-5):
-            raise ValueError(
-                f"history: expected steps of {self._dt} s, or has_varying_dt; got "
-                f"{dt[np.argmax(np.abs(dt - self._dt))]}"
-            )
-        rows = np.flatnonzero(mask)
-
-        def put(table: Array, leaf: Array) -> Array:
-            array = np.array(table)
-            array[:num_rows] = np.asarray(leaf)[rows]
-            return on_device(array, array.dtype)
-
-        return jax.tree.map(put, self._empty, history)

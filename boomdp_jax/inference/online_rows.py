@@ -5,9 +5,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.core
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar
+from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar, on_device
 from boomdp_jax.core.checked_input import positive_seconds
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.track_data import TrackData, TrackRow
@@ -97,6 +98,40 @@ def new_row(
         starts_episode=starts_episode,
         is_chained=is_same & ~starts_episode,
     )
+
+
+def table_of(empty: History, history: History, dt: float | None) -> History:
+    """A history's rows in a table.
+
+    Args:
+        empty: the table, of a capacity.
+        history: transitions.
+        dt: length of all steps [s]; None: lengths vary.
+
+    Raises:
+        ValueError: more transitions than there is room for, steps of another length.
+    """
+    mask = np.asarray(history.mask)
+    num_rows = int(mask.sum())
+    if num_rows > empty.capacity:
+        raise ValueError(
+            f"history: expected at most {empty.capacity} transitions, the capacity; "
+            f"got {num_rows}"
+        )
+    lengths = np.asarray(history.dt, float)[mask]
+    if dt is not None and not np.allclose(lengths, dt, rtol=1e-5):
+        raise ValueError(
+            f"history: expected steps of {dt} s, or has_varying_dt; got "
+            f"{lengths[np.argmax(np.abs(lengths - dt))]}"
+        )
+    rows = np.flatnonzero(mask)
+
+    def put(table: Array, leaf: Array) -> Array:
+        array = np.array(table)
+        array[:num_rows] = np.asarray(leaf)[rows]
+        return on_device(array, array.dtype)
+
+    return jax.tree.map(put, empty, history)
 
 
 def append_row(history: History, num_rows: IntScalar, row: NewRow) -> History:

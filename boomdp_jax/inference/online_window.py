@@ -16,6 +16,11 @@ from boomdp_jax.inference.target import StructureTarget
 _SMALL_TABLE = 4
 
 
+def table_sizes(capacity: int) -> tuple[int, int]:
+    """Rows of the tables that fits are made on, for a table of some capacity."""
+    return -(-capacity // _SMALL_TABLE), capacity
+
+
 def windowed(history: History, begin: int, end: int, cut: int | None) -> History:
     """Take some rows into a table of their own.
 
@@ -28,9 +33,8 @@ def windowed(history: History, begin: int, end: int, cut: int | None) -> History
     Returns:
         A table of the same capacity, or of a quarter of it where that is enough.
     """
-    small = -(-history.capacity // _SMALL_TABLE)
-    capacity = small if end - begin <= small else history.capacity
     num = end - begin
+    capacity = min(size for size in table_sizes(history.capacity) if size >= num)
 
     def take(leaf: Array) -> Array:
         array = np.zeros((capacity, *leaf.shape[1:]), leaf.dtype)

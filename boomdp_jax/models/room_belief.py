@@ -6,6 +6,7 @@ Whoever knows the truth, or does not learn, believes the same from beginning to 
 
 import abc
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +29,9 @@ from boomdp_jax.planning.belief import Belief
 
 # Odds of being of a kind that was tried, below which a thing is left as it was.
 _LEAST_ODDS = 0.1
+# Steps of a first push, for the sake of which programs are compiled beforehand.
+_FEW_ROWS = 8
+_COMPILER = ThreadPoolExecutor(max_workers=1)
 
 
 class RoomBelief(abc.ABC):
@@ -52,6 +56,10 @@ class RoomBelief(abc.ABC):
     @abc.abstractmethod
     def shares(self, thing: int) -> dict[str, float]:
         """Probability of each kind of thing."""
+
+    @abc.abstractmethod
+    def warm_up(self) -> None:
+        """Compile what learning needs, on a thread; the first lesson waits for it."""
 
     def mass(self, thing: int) -> float:
         """Expected mass of a thing [kg]."""
@@ -93,6 +101,9 @@ class FixedRoom(RoomBelief):
     def update(self, key: Key, thing: int, rows: Sequence[Row]) -> None:
         """Nothing is learnt."""
 
+    def warm_up(self) -> None:
+        """Nothing is learnt."""
+
     def shares(self, thing: int) -> dict[str, float]:
         """Probability of each kind of thing."""
         belief = self._beliefs[thing]
@@ -130,6 +141,19 @@ class LearntRoom(RoomBelief):
         self._num_labels = max(len({thing.label for thing in room.things}), 2)
         self._force = room.robot.force
         self._is_point = is_point
+        self._compiled: Future | None = None
+
+    def warm_up(self) -> None:
+        """Compile what learning needs, on a thread; the first lesson waits for it."""
+        is_double = jnp.zeros(()).dtype == jnp.float64
+
+        def compile_all() -> None:
+            # Whether floats are double is a setting of the thread.
+            with jax.enable_x64(is_double):
+                for model in self._models:
+                    model.online.warm_up(_FEW_ROWS)
+
+        self._compiled = _COMPILER.submit(compile_all)
 
     def belief(self, thing: int) -> Belief:
         """Draws of the posterior; or the most probable structure's best numbers."""
@@ -151,6 +175,9 @@ class LearntRoom(RoomBelief):
 
     def update(self, key: Key, thing: int, rows: Sequence[Row]) -> None:
         """Learn from one push."""
+        if self._compiled is not None:
+            self._compiled.result()
+            self._compiled = None
         self._learnt[thing] = self._models[thing].update(key, self._learnt[thing], rows)
         if self._shares:
             self._tell_kin()
