@@ -130,13 +130,18 @@ def prepare_lone(
 
 
 def _told(scene: Scene, params: Params) -> tuple[Scene, Params]:
-    """Numbers and truth values of both, without the corners, which do not count."""
+    """What counts of both: no corners, no indices, and nothing of other kinds."""
     seen = eqx.tree_at(lambda s: (s.vertices, s.vertex_mask), scene, (None, None))
 
-    def is_told(leaf: Array) -> bool:
-        return not jnp.issubdtype(leaf.dtype, jnp.integer)
+    def masks(params: Params) -> tuple:
+        return params.revolute.active, params.wheel.active, params.ground.active
 
-    return eqx.filter((seen, params), is_told)
+    def others(params: Params) -> tuple:
+        joints, more = params.revolute, (params.prismatic, params.weld)
+        return joints.body_a, joints.body_b, params.distance, params.surface, *more
+
+    said = eqx.tree_at(others, params, (None,) * 6, is_leaf=lambda x: x is None)
+    return seen, eqx.tree_at(masks, said, replace_fn=lambda on: jnp.asarray(on, bool))
 
 
 def _lone_numbers(scene: Scene, params: Params, length: FloatScalar) -> tuple:
