@@ -45,6 +45,7 @@ gravity) is much, a tenth of it little. Restitution keeps its jump.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -116,6 +117,15 @@ def step(
     state = checked_state(scene.num_bodies, state)
     wrench = checked_wrench(scene.num_bodies, wrench)
     length = checked_step_length(scene.dt if dt is None else dt, state.pose.dtype)
+    return _stepped(scene, params, length, state, wrench, cache)
+
+
+# Inlined wherever it is traced; by itself it is compiled once, and not its loops anew
+# at every call.
+@functools.partial(jax.jit, inline=True)
+def _stepped(
+    scene: Scene, params: Params, length: Array, state: State, wrench: Array, cache: Any
+) -> tuple[State, StepInfo]:
     return _step_of(scene, params, length)(state, wrench, cache)
 
 
@@ -144,6 +154,7 @@ def prepare_step(
     return Partial(_without_cache, _step_of(scene, params, length))
 
 
+@functools.partial(jax.jit, inline=True)
 def _without_cache(advance: Callable, state: State, wrench: Array) -> tuple:
     return advance(state, wrench, None)
 
@@ -182,11 +193,18 @@ def rollout(
     length = checked_length(
         scene.dt if dt is None else dt, wrenches.shape[0], state.pose.dtype
     )
+    return _rolled_out(scene, params, state, wrenches, length)
+
+
+@functools.partial(jax.jit, inline=True)
+def _rolled_out(
+    scene: Scene, params: Params, state: State, wrenches: Array, length: Array
+) -> tuple[State, StepInfo]:
     if params.actuator is not None:
         wrenches = jax.vmap(lambda wrench: applied(params, wrench, scene.is_static))(
             wrenches
         )
-        return rollout(scene, without_actuator(params), state, wrenches, dt=length)
+        return _rolled_out(scene, without_actuator(params), state, wrenches, length)
     if params.center_of_mass is not None:
         return _rollout_of_reference(scene, params, state, wrenches, length)
     if not is_lone(scene, params):

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from boomdp_jax.physics import rollout, step
+from boomdp_jax.core.compile_time import CompileClock
+from boomdp_jax.physics import prepare_step, rollout, step
 from tests.physics.scenes import make_params, make_scene, make_state
 from tests.reference.planar_dynamics import Pin, Wheel, World
 
@@ -39,6 +40,27 @@ def test_compiled_step_equals_the_eager_one(precision):
 
 
 @pytest.mark.slow
+def test_without_jit_nothing_is_compiled_twice():
+    """As who tries it in a loop of Python's would have it."""
+    scene, params, state = start(PINNED)
+    pushes = jnp.asarray(np.tile(PUSH, (5, 1, 1)), float)
+
+    def run():
+        prepared = prepare_step(scene, params)
+        jax.block_until_ready(rollout(scene, params, state, pushes))
+        jax.block_until_ready(jax.vmap(step, (None, None, None, 0))(*world, pushes))
+        now = step(*world, pushes[0])[0]
+        return prepared(now, pushes[1])[0].array
+
+    world = (scene, params, state)
+    with CompileClock() as first:
+        expected = run()
+    with CompileClock() as again:
+        np.testing.assert_array_equal(run(), expected)
+    assert first.seconds > 0.0
+    assert again.seconds == 0.0
+
+
 def test_rollout_equals_a_loop_of_steps_with_the_cache_handed_on():
     scene, params, state = start()
     push = jnp.asarray(PUSH)
