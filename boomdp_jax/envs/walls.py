@@ -147,6 +147,8 @@ def touches(walls: Walls, outline: Outline, pose: Float[Array, "3"]) -> BoolScal
     return wall_separation(walls, outline, pose) < 0.0
 
 
+# Inlined wherever it is traced; by itself it is compiled once.
+@functools.partial(jax.jit, inline=True)
 def stopped_at_walls(
     walls: Walls, outline: Outline, state: State, next_state: State
 ) -> State:

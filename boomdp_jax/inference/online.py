@@ -180,6 +180,12 @@ class OnlineBelief:
             ValueError: a history of another number of bodies, of more transitions than
                 the capacity, or of steps of another length.
         """
+        table, num_rows = self._empty, 0
+        if history is not None:
+            check_history(self.spec, history)
+            dt = self._dt if self._settings.is_uniform else None
+            table = table_of(self._empty, history, dt)
+            num_rows = int(table.num_transitions)
         key, prior_key = jax.random.split(key)
         beliefs = {
             index: prior_belief(
@@ -190,26 +196,14 @@ class OnlineBelief:
         integer = jnp.zeros((), int).dtype
         state = BeliefState(
             key=key,
-            history=self._empty,
-            num_rows=on_device(0, integer),
-            num_seen=on_device(0, integer),
+            history=table,
+            num_rows=on_device(num_rows, integer),
+            num_seen=on_device(num_rows, integer),
             refit_at=on_device(_FIRST_REFIT, integer),
             refit_after=on_device(_REST, integer),
             blocks=self._stacked(beliefs),
         )
-        if history is None:
-            return state
-        check_history(self.spec, history)
-        dt = self._dt if self._settings.is_uniform else None
-        table = table_of(self._empty, history, dt)
-        if (num_rows := int(table.num_transitions)) == 0:
-            return state
-        state = eqx.tree_at(
-            lambda s: (s.history, s.num_rows, s.num_seen),
-            state,
-            (table, on_device(num_rows, integer), on_device(num_rows, integer)),
-        )
-        return self.refit(state)[0]
+        return self.refit(state)[0] if num_rows else state
 
     def step(
         self,

@@ -340,7 +340,7 @@ def test_histories_that_do_not_fit_are_refused():
     state = NOISE * np.ones((9, 1, 6))
     long = make_history(state, state[..., :3], state, 0.02)
     with pytest.raises(ValueError, match="expected at most 8 transitions"):
-        belief._checked(long)
+        belief.init(jax.random.key(0), long)
     slow = make_history(state[:2], state[:2, :, :3], state[:2], 0.05)
     with pytest.raises(ValueError, match=r"expected steps of 0\.02 s"):
-        belief._checked(slow)
+        belief.init(jax.random.key(0), slow)
