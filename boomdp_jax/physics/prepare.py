@@ -1,7 +1,6 @@
 """What depends on scene, params and step length alone, out of the time loop."""
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -146,7 +145,7 @@ def _told(scene: Scene, params: Params) -> tuple[Scene, Params]:
 
 def _lone_numbers(scene: Scene, params: Params, length: FloatScalar) -> tuple:
     """A lone body's numbers, but for the first two, the same for all hypotheses."""
-    bodies, groups = prepare_bodies(scene, params, length, lambda values: values)
+    bodies, groups = prepare_bodies(scene, params, length, is_one_loop=True)
     facing = jnp.zeros_like(bodies.mass)
     if groups.num_wheels:
         facing = wheel_headings(params.wheel)[0, 0]
@@ -180,15 +179,7 @@ def prepare_world(
     """
 
     def of_one(scene, params, length):
-        one = runtime_one(scene.area[0])
-
-        def held(values):
-            # Else the compiler works all of this out again for whatever reads it.
-            return jax.tree.map(
-                lambda leaf: hold(leaf, jnp.broadcast_to(one, leaf.shape)), values
-            )
-
-        return prepare_bodies(scene, params, length, held)[0]
+        return prepare_bodies(scene, params, length, is_one_loop=False)[0]
 
     bodies = jax.vmap(of_one, in_axes=-1, out_axes=-1)(scene, params, length)
     length = bodies.length
@@ -208,7 +199,7 @@ def prepare_world(
 
 
 def prepare_bodies(
-    scene: Scene, params: Params, length: FloatScalar, keep: Callable[[Any], Any]
+    scene: Scene, params: Params, length: FloatScalar, *, is_one_loop: bool
 ) -> tuple[Bodies, Groups]:
     """Masses, frictions with impulses in place of forces, and their blend weights.
 
@@ -216,7 +207,8 @@ def prepare_bodies(
         scene: outlines, feet, gravity; not in lanes.
         params: one hypothesis.
         length: of a step [s].
-        keep: done to what several others use.
+        is_one_loop: whether all of it becomes one loop, where nothing is worked out
+            twice.
 
     Returns:
         What is of each body, and which points of friction belong together. Of a lone
@@ -243,9 +235,19 @@ def prepare_bodies(
             else jax.tree.map(lambda *parts: jnp.concatenate(parts), spins, joints)
         )
     inverse = _mobility(pins, mass, inertia)
+    one = runtime_one(mass)
+
+    def held(values):
+        # Else the compiler works all of this out again for whatever reads it.
+        if is_one_loop:
+            return values
+        return jax.tree.map(
+            lambda leaf: hold(leaf, jnp.broadcast_to(one, leaf.shape)), values
+        )
+
     groups = contact_groups(scene, params)
-    contacts, spins, inverse = keep((contacts, spins, inverse))
-    contacts, spins = keep(
+    contacts, spins, inverse = held((contacts, spins, inverse))
+    contacts, spins = held(
         fit_weights(groups, contacts, spins, inverse, mass, inertia, mobile, length)
     )
     weight = (length * mass * scene.gravity[0], length * mass * scene.gravity[1])
