@@ -16,6 +16,7 @@ from boomdp_jax.agents.namo_agent import (
 )
 from boomdp_jax.agents.namo_hand import Hand
 from boomdp_jax.core.arrays import Key
+from boomdp_jax.core.thread_precision import in_this_precision
 from boomdp_jax.envs.namo import (
     NOBODY,
     NamoState,
@@ -123,7 +124,7 @@ class _Episode:
         # The world's step takes long to compile; the first plan is made meanwhile.
         nothing = pushing(jnp.zeros(3))
         self._compiled: Future | None = _COMPILER.submit(
-            drive, key, self.world, self.state, nothing
+            in_this_precision(drive), key, self.world, self.state, nothing
         )
         belief.warm_up()
 

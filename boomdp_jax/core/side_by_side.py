@@ -15,6 +15,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from boomdp_jax.core.thread_precision import in_this_precision
+
 # What has been called before, and is therefore compiled.
 _compiled: set[object] = set()
 
@@ -54,13 +56,11 @@ def call_each(
     """
     leaves, treedef = jax.tree.flatten(like)
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-    # Whether floats are double is a setting of the thread.
-    is_double = jnp.zeros(()).dtype == jnp.float64
-    key = (function, treedef, shapes, is_double)
+    key = (function, treedef, shapes, jnp.zeros(()).dtype)
+    of_arguments = in_this_precision(function)
 
     def call(arguments: tuple) -> Any:
-        with jax.enable_x64(is_double):
-            return function(*arguments)
+        return of_arguments(*arguments)
 
     results = []
     if key not in _compiled and inputs:

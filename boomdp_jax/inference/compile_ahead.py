@@ -10,7 +10,8 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
+
+from boomdp_jax.core.thread_precision import in_this_precision
 
 # Signatures of the targets for which it has been done in this process.
 _done: set[object] = set()
@@ -38,15 +39,8 @@ class CompileAhead:
     def __enter__(self) -> "CompileAhead":
         work = self._work
         if work is not None:
-            # Whether floats are double is a setting of the thread.
-            is_double = jnp.zeros(()).dtype == jnp.float64
-
-            def run() -> object:
-                with jax.enable_x64(is_double):
-                    return work()
-
             self._pool = concurrent.futures.ThreadPoolExecutor(1)
-            self._pool.submit(run)
+            self._pool.submit(in_this_precision(work))
         return self
 
     def __exit__(self, *_: object) -> None:

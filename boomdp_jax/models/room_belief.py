@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from boomdp_jax.core.arrays import Key
+from boomdp_jax.core.thread_precision import in_this_precision
 from boomdp_jax.envs.namo_room import Room, thing_scene
 from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.models.kin import kin_draws, kin_odds
@@ -145,15 +146,12 @@ class LearntRoom(RoomBelief):
 
     def warm_up(self) -> None:
         """Compile what learning needs, on a thread; the first lesson waits for it."""
-        is_double = jnp.zeros(()).dtype == jnp.float64
 
         def compile_all() -> None:
-            # Whether floats are double is a setting of the thread.
-            with jax.enable_x64(is_double):
-                for model in self._models:
-                    model.online.warm_up(_FEW_ROWS)
+            for model in self._models:
+                model.online.warm_up(_FEW_ROWS)
 
-        self._compiled = _COMPILER.submit(compile_all)
+        self._compiled = _COMPILER.submit(in_this_precision(compile_all))
 
     def belief(self, thing: int) -> Belief:
         """Draws of the posterior; or the most probable structure's best numbers."""
