@@ -27,17 +27,19 @@ def _parts(body):
     return parts_of(body.jaxpr)
 
 
-def by_vmap(*arguments, body, passed):
+def by_vmap(*arguments, body, passed, is_marked):
     """Apply a body as everywhere else in JAX.
 
     Args:
         arguments: arrays of one shape, and scalars.
         body: `one_loop`'s, a function of scalars.
         passed: which arguments are handed on.
+        is_marked: of no concern here.
 
     Returns:
         The results, and the arguments that are handed on.
     """
+    del is_marked
     shape, handed_on = common_shape(arguments), [arguments[i] for i in passed]
     if not shape:
         return [*body.function(*arguments), *handed_on]
@@ -47,15 +49,22 @@ def by_vmap(*arguments, body, passed):
     return [leaf.reshape(shape) for leaf in out] + handed_on
 
 
-def by_reduction(*arguments, body, passed):
-    """The same by functions of windowed reductions, given and returning the same."""
+def by_reduction(*arguments, body, passed, is_marked):
+    """The same by functions of windowed reductions, given and returning the same.
+
+    Args:
+        arguments: as for `by_vmap`.
+        body: likewise.
+        passed: likewise.
+        is_marked: whether a loop that many are worked out in should not be merged.
+    """
     shape, values, out = common_shape(arguments), list(arguments), []
     # One mark that it should not be merged is enough for all parts.
-    is_marked = int(np.prod(shape)) < _MANY
+    needs_mark = is_marked and int(np.prod(shape)) >= _MANY
     for part in _parts(body):
         inputs = [values[i] for i in part.inputs]
-        out = _reduction(part.function, inputs, part.num_outputs, not is_marked)
-        is_marked, values = True, values + out
+        out = _reduction(part.function, inputs, part.num_outputs, needs_mark)
+        needs_mark, values = False, values + out
     # A result that depends on scalars alone is one.
     results = [jnp.broadcast_to(leaf, shape) for leaf in out]
     return results + [arguments[i] for i in passed]

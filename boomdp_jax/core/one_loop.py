@@ -67,6 +67,7 @@ def one_loop(
     *arguments: Any,
     static: tuple[Hashable, ...] = (),
     num_passed: int = 0,
+    is_marked: bool = True,
 ) -> Any:
     """Apply a function of scalars, as one loop wherever it is batched.
 
@@ -82,6 +83,9 @@ def one_loop(
         arguments: trees of scalars of one floating type.
         static: what the function takes before its arguments, hashable.
         num_passed: so many arguments, the first ones, are handed on.
+        is_marked: whether a loop that this is worked out in is to be kept from being
+            merged (`unmerged`). One mark is enough for a loop, and for those round it;
+            derivatives are marked anyway.
 
     Returns:
         What the function returns; and before it those arguments, if there are any that
@@ -97,17 +101,15 @@ def one_loop(
     dtype = jnp.result_type(*leaves)
     if not jnp.issubdtype(dtype, jnp.floating):
         raise TypeError(f"one_loop works on floating numbers, got {dtype}")
-    for leaf in leaves:
-        if jnp.shape(leaf):
-            raise TypeError(
-                f"one_loop works on scalars, got an array of shape {jnp.shape(leaf)}"
-            )
+    for shape in map(jnp.shape, leaves):
+        if shape:
+            raise TypeError(f"one_loop works on scalars, got an array of shape {shape}")
     is_double = jnp.result_type(float) == jnp.float64
     body, tree_out = _traced(function, static, treedef, np.dtype(dtype), is_double)
     flat = [jnp.asarray(leaf, dtype) for leaf in leaves]
     handed_on, treedef_on = jax.tree.flatten(arguments[:num_passed])
     passed = tuple(range(len(handed_on)))
-    out = _one_loop_p.bind(*flat, body=body, passed=passed)
+    out = _one_loop_p.bind(*flat, body=body, passed=passed, is_marked=is_marked)
     num = len(body.jaxpr.out_avals)
     result = jax.tree.unflatten(tree_out, out[:num])
     if not num_passed:
@@ -188,31 +190,31 @@ def _jaxpr_of(function, dtypes):
 
 
 @_one_loop_p.def_abstract_eval
-def _shapes(*avals, body, passed):
-    """Of the results, and of the arguments that are handed on."""
+def _shapes(*avals, body, passed, **_):
+    """Of the results, and of what is handed on."""
     shape = common_shape(avals)
     results = [jax.core.ShapedArray(shape, aval.dtype) for aval in body.jaxpr.out_avals]
     return [*results, *(avals[i] for i in passed)]
 
 
 @functools.lru_cache(maxsize=256)
-def _compiled(body, passed):
+def _compiled(**params):
     def run(*arguments):
         if any(isinstance(a, jax.core.Tracer) for a in arguments):
-            return _one_loop_p.bind(*arguments, body=body, passed=passed)
+            return _one_loop_p.bind(*arguments, **params)
         # Compilation is switched off.
-        out = by_vmap(*arguments, body=body, passed=passed)
+        out = by_vmap(*arguments, **params)
         return [jnp.asarray(leaf) for leaf in out]
 
     return jax.jit(run)
 
 
 @_one_loop_p.def_impl
-def _run(*arguments, body, passed):
-    return _compiled(body, passed)(*arguments)
+def _run(*arguments, **params):
+    return _compiled(**params)(*arguments)
 
 
-def _batched(arguments: Sequence, dims: Sequence, *, body, passed):
+def _batched(arguments: Sequence, dims: Sequence, *, body, passed, **mark):
     """Scalars that are not batched stay scalars; everything else gets one shape."""
     size = next(
         a.shape[d] for a, d in zip(arguments, dims, strict=True) if d is not None
@@ -238,7 +240,7 @@ def _batched(arguments: Sequence, dims: Sequence, *, body, passed):
     spreads = [spread(a, d is not None) for a, d in zip(moved, dims, strict=True)]
     # What had to be spread for this is handed on as it was, from here.
     inside = [i for i in passed if spreads[i].shape == moved[i].shape]
-    out = _one_loop_p.bind(*spreads, body=body, passed=tuple(inside))
+    out = _one_loop_p.bind(*spreads, body=body, passed=tuple(inside), **mark)
     num = len(out) - len(inside)
     handed_on = dict(zip(inside, out[num:], strict=True))
     out = out[:num] + [handed_on.get(i, moved[i]) for i in passed]
@@ -307,8 +309,8 @@ def _moving_results(body: _Body, active: tuple[int, ...]) -> tuple[bool, ...]:
     return depends_on(body.jaxpr.jaxpr, [i in active for i in range(num)])
 
 
-def _jvp(primals, tangents, *, body, passed):
-    out = _one_loop_p.bind(*primals, body=body, passed=passed)
+def _jvp(primals, tangents, *, body, passed, **mark):
+    out = _one_loop_p.bind(*primals, body=body, passed=passed, **mark)
     num_results = len(out) - len(passed)
     active = tuple(i for i, t in enumerate(tangents) if type(t) is not ad.Zero)
     first = len(primals) - body.num_linear
@@ -334,7 +336,8 @@ def _jvp(primals, tangents, *, body, passed):
             rates_out[num_results + k] = tangents[passed[k]]
         return out, rates_out
     passed_on = tuple(places[passed[k]] for k in handed_on)
-    moved = _one_loop_p.bind(*arguments, body=tangent, passed=passed_on)
+    mark["is_marked"] = True
+    moved = _one_loop_p.bind(*arguments, body=tangent, passed=passed_on, **mark)
     # Tangents of a batch's scalars may be scalars still.
     for i, m in zip(moving, moved[: len(moving)], strict=True):
         shape = out[i].shape
@@ -347,7 +350,7 @@ def _jvp(primals, tangents, *, body, passed):
 ad.primitive_jvps[_one_loop_p] = _jvp
 
 
-def _transpose(cotangents, *arguments, body, passed):
+def _transpose(cotangents, *arguments, body, passed, **mark):
     num = len(arguments) - body.num_linear
     others, linear = arguments[:num], arguments[num:]
     num_results = len(body.jaxpr.out_avals)
@@ -366,7 +369,7 @@ def _transpose(cotangents, *arguments, body, passed):
         added = tuple(i for i in back if linear[i].aval.shape == shape)
         given = [cotangents[i] for i in present] + [back.pop(i) for i in added]
         transposed = _transposed(body, present, added)
-        out = _one_loop_p.bind(*others, *given, body=transposed, passed=())
+        out = _one_loop_p.bind(*others, *given, body=transposed, passed=(), **mark)
         out = [
             # What went out to a whole batch comes back as a sum.
             jnp.sum(ct)

@@ -12,7 +12,9 @@ turn from the end of the step back to mid-step, where impulses act, and $\Theta$
 share of the end velocity; R e is what is returned. One wheel is solved by one scalar
 equation (`lone_wheel`). Several contacts are solved by Newton's method from the
 solution in which all stick, which is linear with coefficients that do not change
-(`Stuck`). Derivatives come from the implicit function theorem: one 3 x 3 system, in
+(`Stuck`): by a fixed number of iterations in the same loop as everything else, or by
+as many as one of a batch needs (`begin_search`, `search_on`), whose result is then
+handed in. Derivatives come from the implicit function theorem: one 3 x 3 system, in
 both modes.
 """
 
@@ -41,6 +43,10 @@ from boomdp_jax.physics.lone_contacts import (
 from boomdp_jax.physics.lone_wheel import Grip, slipping_wheel
 from boomdp_jax.physics.small_linear import solve3
 
+# An iteration that changes a motion by less than this power of the rounding unit (of
+# what it is) was the last: Newton's method squares what is left to correct.
+_SETTLED = 0.7
+
 
 class Brake(NamedTuple):
     """Friction against spin."""
@@ -61,6 +67,17 @@ class Stuck(NamedTuple):
     """Impulse per motion at the end, F^T C Theta F."""
     start: tuple
     """Impulse per motion at the start, F^T C (1 - Theta) F."""
+
+
+class Search(NamedTuple):
+    """Newton's method under way."""
+
+    found: Triple
+    """The iterate, frame at the end of the step."""
+    before: Triple
+    """In the iteration before."""
+    is_open: FloatScalar
+    """One while the iterate still changes, else zero: it then stays what it is."""
 
 
 class SlidingProblem(NamedTuple):
@@ -146,8 +163,8 @@ def _linearise(problem: SlidingProblem, e: Triple, before: Triple | None):
     return _miss(problem, solution, impulse), _jacobian(problem, entries)
 
 
-def _newton(problem: SlidingProblem, stuck: Stuck) -> Triple:
-    """Several contacts: start from all of them sticking, then iterate."""
+def _all_stuck(problem: SlidingProblem, stuck: Stuck) -> Triple:
+    """The solution without limits."""
     xx, xy, xt, yy, yt, tt = stuck.start
     ux, uy, spin = problem.start
     x = problem.push[0] - (xx * ux + xy * uy + xt * spin)
@@ -157,11 +174,57 @@ def _newton(problem: SlidingProblem, stuck: Stuck) -> Triple:
     pushed = (slide * x, slide * y, turn * moment)
     xx, xy, xt, yy, yt, tt = stuck.end
     jacobian = _jacobian(problem, (xx, xy, xt, xy, yy, yt, xt, yt, tt))
-    e = solve3(jacobian, pushed)
-    before = e
+    return solve3(jacobian, pushed)
+
+
+def _newton(problem: SlidingProblem, stuck: Stuck) -> Triple:
+    """Several contacts: start from all of them sticking, then iterate."""
+    e = before = _all_stuck(problem, stuck)
     for _ in range(NUM_NEWTON):
         e, before = _newton_step(problem, e, before)
     return e
+
+
+def begin_search(problem: SlidingProblem, stuck: Stuck, mass: FloatScalar) -> Search:
+    """Several contacts: start from all of them sticking, and iterate once.
+
+    Args:
+        problem: momenta and frictions.
+        stuck: the same friction without limits.
+        mass: of the body [kg].
+
+    Returns:
+        For `search_on`, as long as anyone of a batch is open, `NUM_NEWTON` iterations
+        with this one at most.
+    """
+    e = _all_stuck(problem, stuck)
+    return _searched(problem, mass, e, e)
+
+
+def search_on(problem: SlidingProblem, mass: FloatScalar, search: Search) -> Search:
+    """One iteration more for what is open."""
+    now = _searched(problem, mass, search.found, search.before)
+    new, old = (jax.tree.leaves(v) for v in (now, search))
+    # What is done stays as it is, whatever the others of its batch do.
+    kept = [jnp.where(search.is_open > 0, a, b) for a, b in zip(new, old, strict=True)]
+    return jax.tree.unflatten(jax.tree.structure(search), kept)
+
+
+def _searched(
+    problem: SlidingProblem, mass: FloatScalar, e: Triple, before: Triple
+) -> Search:
+    found, _ = _newton_step(problem, e, before)
+    change = (found[0] - e[0], found[1] - e[1], found[2] - e[2])
+
+    def energy(motion: Triple) -> FloatScalar:
+        x, y, spin = motion
+        return mass * (x * x + y * y) + problem.ease[1] * spin * spin
+
+    share = float(jnp.finfo(mass.dtype).eps) ** _SETTLED
+    least = share**2 * (energy(found) + energy(problem.start))
+    # What is not finite does not hold up the others.
+    is_open = jnp.where(energy(change) > least, 1.0, 0.0).astype(mass.dtype)
+    return Search(found, e, is_open)
 
 
 def _newton_step(
@@ -172,7 +235,9 @@ def _newton_step(
     return tuple(a - b for a, b in zip(e, change, strict=True)), e
 
 
-def solve_sliding(problem: SlidingProblem, aid: Stuck | Grip | None) -> Triple:
+def solve_sliding(
+    problem: SlidingProblem, aid: Stuck | Grip | None, found: Triple | None = None
+) -> Triple:
     """Velocity of the anchor and spin at the end of a step.
 
     Args:
@@ -180,6 +245,8 @@ def solve_sliding(problem: SlidingProblem, aid: Stuck | Grip | None) -> Triple:
         aid: the same friction without limits; of a single contact or none, the grip of
             the pin's friction, if there is a pin. Not differentiated: it says nothing
             that the problem does not.
+        found: the solution, if it was searched for before, as `Search.found` has it.
+            Not differentiated either.
 
     Returns:
         The anchor's velocity [m/s], in the frame at mid-step, and the spin [rad/s].
@@ -187,15 +254,17 @@ def solve_sliding(problem: SlidingProblem, aid: Stuck | Grip | None) -> Triple:
     """
 
     @jax.custom_jvp
-    def solve(problem, aid):
-        if not isinstance(aid, Stuck):
-            return slipping_wheel(problem, aid)
-        x, y, spin = _newton(problem, aid)
+    def solve(problem, aid, found):
+        if found is None:
+            if not isinstance(aid, Stuck):
+                return slipping_wheel(problem, aid)
+            found = _newton(problem, aid)
+        x, y, spin = found
         return *out_of(problem.turn, x, y), spin
 
     def solve_jvp(primals, tangents):
-        (problem, aid), (rate, _) = primals, tangents
-        solution = solve(problem, aid)
+        (problem, aid, found), (rate, *_) = primals, tangents
+        solution = solve(problem, aid, found)
         leaves, treedef = jax.tree.flatten(problem)
         rates = jax.tree.leaves(
             rate, is_leaf=lambda x: isinstance(x, jax.custom_derivatives.SymbolicZero)
@@ -221,4 +290,4 @@ def solve_sliding(problem: SlidingProblem, aid: Stuck | Grip | None) -> Triple:
         return solution, (*out_of(problem.turn, x, y), spin)
 
     solve.defjvp(solve_jvp, symbolic_zeros=True)
-    return solve(problem, aid)
+    return solve(problem, aid, found)

@@ -16,17 +16,26 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from boomdp_jax.core.any_in_batch import any_in_batch
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar
 from boomdp_jax.core.one_loop import one_loop
+from boomdp_jax.physics.friction import NUM_NEWTON
 from boomdp_jax.physics.lone_body import LoneBody, Pivot
-from boomdp_jax.physics.lone_contacts import Pair, into, out_of
-from boomdp_jax.physics.lone_friction import SlidingProblem, Stuck, solve_sliding
+from boomdp_jax.physics.lone_contacts import Pair, Triple, into, out_of
+from boomdp_jax.physics.lone_friction import (
+    Search,
+    SlidingProblem,
+    Stuck,
+    begin_search,
+    search_on,
+    solve_sliding,
+)
 from boomdp_jax.physics.motion import Motion
 from boomdp_jax.physics.trigonometry import heading_turn, rotated
 
 # Substeps that are written out in one loop; more are compiled as a loop of such loops.
-# With so many the reverse pass is one loop too (`core.scalar_parts`), or takes few.
-_MOST_IN_A_LOOP, _MOST_OF_SEVERAL_CONTACTS = 2, 1
+# With so many the reverse pass is one loop too (`core.scalar_parts`).
+_MOST_IN_A_LOOP = 2
 
 
 class _Turned(NamedTuple):
@@ -51,8 +60,9 @@ def lone_step(
         The motion after the step, the distance by which the pin fails to hold then
         [m], and whether everything is finite.
     """
-    has_several = isinstance(body.aid, Stuck)
-    most = _MOST_OF_SEVERAL_CONTACTS if has_several else _MOST_IN_A_LOOP
+    if isinstance(body.aid, Stuck):
+        return _step_of_several_contacts(body, motion, force, num_substeps)
+    most = _MOST_IN_A_LOOP
     if num_substeps <= most:
         motion, error, count = one_loop(
             _whole_step, body, motion, force, static=(num_substeps,)
@@ -72,8 +82,90 @@ def lone_step(
     return turned.motion, error, count > 0
 
 
-def _whole_step(num_substeps: int, body: LoneBody, motion: Motion, force: tuple):
-    turned = _advanced(num_substeps, body, _begun(body, motion), force)
+def _step_of_several_contacts(
+    body: LoneBody, motion: Motion, force: tuple, num_substeps: int
+) -> tuple[Motion, FloatScalar, BoolScalar]:
+    """The same where Newton's method is needed, one substep after the other."""
+    if num_substeps == 1:
+        found, body = _search(body, motion, force)
+        motion, error, count = one_loop(
+            _whole_step,
+            *(body, motion, force, found),
+            static=(1,),
+            is_marked=found is None,
+        )
+        return motion, error, count > 0
+
+    def advance(turned: _Turned, _: None) -> tuple[_Turned, None]:
+        found, unaided = _search(body, turned, force)
+        turned = one_loop(
+            _advanced,
+            *(unaided, turned, force, found),
+            static=(1,),
+            is_marked=found is None,
+        )
+        return turned, None
+
+    turned = one_loop(_begun, body, motion)
+    turned, _ = jax.lax.scan(advance, turned, None, length=num_substeps)
+    error, count = one_loop(_reported, body, turned)
+    return turned.motion, error, count > 0
+
+
+def _search(
+    body: LoneBody, now: Motion | _Turned, force: tuple
+) -> tuple[Triple | None, LoneBody]:
+    """The next solution for friction, and a body that needs no help to find it.
+
+    Few of a batch need all of Newton's iterations, and at most steps nobody does, so on
+    a CPU it goes on only while one does. What it finds is taken as given by the loop
+    that makes the step: derivatives have nothing to iterate. Other backends would have
+    to wait for every answer; there all iterations are made within that loop.
+    """
+    if jax.default_backend() != "cpu":
+        return None, body
+    given = jax.lax.stop_gradient((body, now, force))
+    search = one_loop(_begun_search, *given, is_marked=False)
+
+    def goes_on(carry: tuple) -> BoolScalar:
+        turn, is_any_open, _ = carry
+        return is_any_open & (turn < NUM_NEWTON)
+
+    def go_on(carry: tuple) -> tuple:
+        turn, _, search = carry
+        search = one_loop(_searched_on, *given, search)
+        return turn + 1, any_in_batch(search.is_open > 0), search
+
+    start = jnp.ones((), jnp.int32), any_in_batch(search.is_open > 0), search
+    search = jax.lax.while_loop(goes_on, go_on, start)[2]
+    return search.found, body._replace(aid=None)
+
+
+def _begun_search(body: LoneBody, now: Motion | _Turned, force: tuple) -> Search:
+    assert isinstance(body.aid, Stuck)
+    problem, _ = _sliding(body, _turned_of(body, now), _impulse(body, force))
+    return begin_search(problem, body.aid, body.mass)
+
+
+def _searched_on(
+    body: LoneBody, now: Motion | _Turned, force: tuple, search: Search
+) -> Search:
+    problem, _ = _sliding(body, _turned_of(body, now), _impulse(body, force))
+    return search_on(problem, body.mass, search)
+
+
+def _turned_of(body: LoneBody, now: Motion | _Turned) -> _Turned:
+    return _begun(body, now) if isinstance(now, Motion) else now
+
+
+def _whole_step(
+    num_substeps: int,
+    body: LoneBody,
+    motion: Motion,
+    force: tuple,
+    found: Triple | None = None,
+):
+    turned = _advanced(num_substeps, body, _begun(body, motion), force, found)
     return turned.motion, *_reported(body, turned)
 
 
@@ -88,17 +180,26 @@ def _begun(body: LoneBody, motion: Motion) -> _Turned:
 
 
 def _advanced(
-    num_substeps: int, body: LoneBody, turned: _Turned, force: tuple
+    num_substeps: int,
+    body: LoneBody,
+    turned: _Turned,
+    force: tuple,
+    found: Triple | None = None,
 ) -> _Turned:
+    impulse = _impulse(body, force)
+    for _ in range(num_substeps):
+        turned = _substep(body, turned, impulse, found)
+    return turned
+
+
+def _impulse(body: LoneBody, force: tuple) -> Triple:
+    """Of a force and of gravity over a substep, world frame."""
     h, mobile = body.length, body.mobile
-    impulse = (
+    return (
         mobile * (h * force[0] + body.weight[0]),
         mobile * (h * force[1] + body.weight[1]),
         mobile * h * force[2],
     )
-    for _ in range(num_substeps):
-        turned = _substep(body, turned, impulse)
-    return turned
 
 
 def _reported(body: LoneBody, turned: _Turned) -> tuple[FloatScalar, FloatScalar]:
@@ -130,7 +231,10 @@ def _offset(pivot: Pivot, motion: Motion, turn: Pair) -> Pair:
     return pivot.active * x + pivot.anchor[0], pivot.active * y + pivot.anchor[1]
 
 
-def _substep(body: LoneBody, turned: _Turned, impulse: tuple) -> _Turned:
+def _sliding(
+    body: LoneBody, turned: _Turned, impulse: Triple
+) -> tuple[SlidingProblem, Pair]:
+    """What friction has to be solved for in a substep, and the frame at mid-step."""
     h = body.length
     motion, start = turned
     vx, vy, spin = motion[3:]
@@ -156,7 +260,17 @@ def _substep(body: LoneBody, turned: _Turned, impulse: tuple) -> _Turned:
         brakes=body.brakes,
         joint=body.joint,
     )
-    slide_x, slide_y, new_spin = solve_sliding(problem, body.aid)
+    return problem, middle
+
+
+def _substep(
+    body: LoneBody, turned: _Turned, impulse: Triple, found: Triple | None
+) -> _Turned:
+    h = body.length
+    motion, start = turned
+    vx, vy, spin = motion[3:]
+    problem, middle = _sliding(body, turned, impulse)
+    slide_x, slide_y, new_spin = solve_sliding(problem, body.aid, found)
     new_vx, new_vy = out_of(middle, slide_x, slide_y)
     angle = 0.5 * h * (spin + new_spin)
     end = rotated(start, angle)

@@ -205,6 +205,25 @@ def test_friction_is_solved_to_the_end():
 
 
 @pytest.mark.slow
+def test_the_rest_of_a_batch_changes_no_bit():
+    # Newton's method goes on for all while one needs it; nobody else may notice.
+    cases = draws(spread=4.0, seed=4)
+    usual = np.asarray(fast_step(*cases))
+    is_other = np.arange(NUM_CASES) % 3 > 0
+    at_rest = jax.tree.map(
+        lambda leaf: jnp.where(
+            is_other.reshape(-1, *(1 for _ in leaf.shape[1:])),
+            jnp.zeros_like(leaf),
+            leaf,
+        ),
+        cases[1:],
+    )
+    found = np.asarray(fast_step(cases[0], *at_rest))
+    np.testing.assert_array_equal(found[~is_other], usual[~is_other])
+    assert np.mean(np.any(found != usual, axis=(1, 2))[is_other]) > 0.9
+
+
+@pytest.mark.slow
 def test_masks_that_are_off_leave_a_free_body():
     params, state, wrench = draws()
     off = jax.tree.map(
