@@ -29,13 +29,11 @@ from boomdp_jax.inference.kalman import (
 from boomdp_jax.inference.robust_update import correct_robustly
 from boomdp_jax.inference.track_data import TrackData, TrackRow, with_delay
 from boomdp_jax.inference.tracking import (
-    Predict,
+    PredictChannels,
     channel_difference,
     channel_differences,
+    channel_predictor,
     cloud_predictor,
-    join_channels,
-    predictor,
-    split_channels,
 )
 from boomdp_jax.inference.used_rows import scan_used
 from boomdp_jax.physics.params import Params
@@ -117,7 +115,8 @@ def _density_of_one_body(
     is_used: Bool[Array, " time"] | None,
 ) -> FloatScalar:
     """The same channel by channel, each a vector in a batch of points."""
-    predict = _cloud_of_channels(predictor(scene, params, data.steps.dt), data.rows)
+    predict = channel_predictor(scene, params, data.steps.dt)
+    predict_all = _cloud_of_channels(predict, data.rows)
     scale = channel_scale(noise.reading).reshape(-1)
     at_first = list((start_factor(data.freedom) * scale) ** 2)
     unknown = list(start_scale(1) ** 2)
@@ -142,7 +141,7 @@ def _density_of_one_body(
         )
         state = [x + move for x, move in zip(state, shift, strict=True)]
         points = [x + offsets[:, i] for i, x in enumerate(state)]
-        images = predict(points, row)
+        images = predict_all(points, row)
         state = [image[0] for image in images]
         shift, lower, last_density = move_and_correct_channels(
             lower,
@@ -164,7 +163,7 @@ def _density_of_one_body(
     return scan_used(advance, carry, data.rows, is_used)[0][2]
 
 
-def _cloud_of_channels(predict: Predict, rows: TrackRow):
+def _cloud_of_channels(predict: PredictChannels, rows: TrackRow):
     """One step of an estimate and its six neighbours, each channel a vector.
 
     What a hypothesis has worked out beforehand is copied for each of the seven here,
@@ -172,7 +171,7 @@ def _cloud_of_channels(predict: Predict, rows: TrackRow):
     """
 
     def one(row: TrackRow, *point):
-        return split_channels(predict(join_channels(point), row.action, row.dt))
+        return predict(list(point), row.action, row.dt)
 
     first = jax.tree.map(lambda leaf: leaf[0], rows)
     pure, known = jax.closure_convert(one, first, *jnp.zeros(6))

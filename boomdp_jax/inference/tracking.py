@@ -32,10 +32,11 @@ from boomdp_jax.inference.contact_prediction import (
 )
 from boomdp_jax.inference.track_data import TrackData, TrackRow, with_delay
 from boomdp_jax.inference.used_rows import scan_used
+from boomdp_jax.physics.motion import Motion
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import state_from_array
-from boomdp_jax.physics.step import prepare_step
+from boomdp_jax.physics.step import next_motion, prepare_step
 
 # Largest number of channels for which products with gains are written out; beyond it
 # a library call costs less than the compilation of so many terms.
@@ -153,6 +154,33 @@ def predictor(
     return predict
 
 
+PredictChannels = Callable[[list, Float[Array, "1 3"], FloatScalar | None], list]
+"""The same of one body, from a list of its channels to such a list."""
+
+
+def channel_predictor(
+    scene: Scene | ContactScene,
+    params: Params,
+    dt: Float[Array, " time"] | Float[Array, ""],
+) -> PredictChannels:
+    """One step of one body, channel by channel.
+
+    Args:
+        scene: the body's scene, with contact or without.
+        params: one hypothesis.
+        dt: as for `predictor`.
+    """
+    if dt.ndim == 0 and isinstance(scene, Scene):
+        prepared = prepare_step(scene, params, dt=dt)
+        return lambda state, action, _: list(
+            next_motion(prepared, Motion(*state), action)
+        )
+    predict = predictor(scene, params, dt)
+    return lambda state, action, length: _split_channels(
+        predict(_join_channels(state), action, length)
+    )
+
+
 Cloud = Callable[
     [Float[Array, "point body 6"], Float[Array, "body 3"], FloatScalar | None],
     Float[Array, "point body 6"],
@@ -209,21 +237,22 @@ def innovations(
         Of the reading that a row starts from and of the one that it ends at;
         independent and of unit variance if hypothesis, gains and noise are right.
     """
-    predict = predictor(scene, params, data.steps.dt)
+    shape, dt = data.steps.state.shape[1:], data.steps.dt
     data = with_delay(params, data)
-
-    def advance(state, inputs):
-        return track_row(predict, state, *inputs)
-
-    shape = data.steps.state.shape[1:]
     if math.prod(shape) > _MAX_WRITTEN_OUT:
+        predict = predictor(scene, params, dt)
+
+        def advance(state, inputs):
+            return track_row(predict, state, *inputs)
+
         return scan_used(advance, jnp.zeros(shape), (data.rows, gains), is_used)[1]
+    predict_channels = channel_predictor(scene, params, dt)
 
     # Channel by channel from row to row: a batch of points is then a vector for each,
     # and all arithmetic is on vectors. As one array of channels for each point the
     # same takes twice as long.
     def advance_channels(channels, inputs):
-        return _track_channels(predict, channels, *inputs)
+        return _track_channels(predict_channels, channels, *inputs)
 
     start = list(jnp.zeros(math.prod(shape)))
     _, whitened = scan_used(advance_channels, start, (data.rows, gains), is_used)
@@ -261,7 +290,7 @@ def track_row(
     return state, jnp.stack([first_error, last_error])
 
 
-def _track_channels(predict: Predict, state: list, row: TrackRow, gains: Gains):
+def _track_channels(predict: PredictChannels, state: list, row: TrackRow, gains: Gains):
     """As `track_row` for one body, whose channels stay apart from row to row.
 
     Worth it in a scan only: the online step, which keeps states as arrays, takes half
@@ -280,20 +309,20 @@ def _track_channels(predict: Predict, state: list, row: TrackRow, gains: Gains):
     state, first_error = correct(
         state, row.first, row.first_mask, gains.first, gains.first_whitening
     )
-    state = split_channels(predict(join_channels(state), row.action, row.dt))
+    state = predict(state, row.action, row.dt)
     state, last_error = correct(
         state, row.last, row.last_mask, gains.last, gains.last_whitening
     )
     return state, first_error + last_error
 
 
-def split_channels(state: Float[Array, "1 6"]) -> list:
+def _split_channels(state: Float[Array, "1 6"]) -> list:
     """One by one: by slices, which take nothing where channels were just joined."""
     each = [jax.lax.slice_in_dim(state, i, i + 1, axis=1) for i in range(6)]
     return [x.reshape(()) for x in each]
 
 
-def join_channels(channels: Sequence) -> Float[Array, "1 6"]:
+def _join_channels(channels: Sequence) -> Float[Array, "1 6"]:
     """Back to channels of one body."""
     return jnp.concatenate([x.reshape(1, 1) for x in channels], axis=1)
 

@@ -159,6 +159,30 @@ def _without_cache(advance: Callable, state: State, wrench: Array) -> tuple:
     return advance(state, wrench, None)
 
 
+def next_motion(prepared: Callable, motion: Motion, wrench: Array) -> Motion:
+    """What `prepare_step` returns, applied to a lone body number by number.
+
+    In a loop over steps whose carries are numbers, arrays that are put together for a
+    step and taken apart after it take as long as much of the step.
+
+    Args:
+        prepared: by `prepare_step`, of a scene of one body.
+        motion: before.
+        wrench: `[1, 3]`, as for `step` [N, N, N m].
+
+    Returns:
+        The motion after the step.
+    """
+    assert isinstance(prepared, Partial)
+    advance = prepared.args[0] if prepared.func is _without_cache else prepared
+    if advance.func is _lone_step:
+        return _lone(*advance.args, motion, wrench)[0]
+    if advance.func is _step_applied:
+        within, scene, params = advance.args
+        return next_motion(within, motion, applied(params, wrench, scene.is_static))
+    return motion_of(advance(state_of(motion, 1), wrench, None)[0])
+
+
 def rollout(
     scene: Scene,
     params: Params,

@@ -1,12 +1,16 @@
 """Transforms of JAX: jit, vmap and scan give what eager steps give, in one trace."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from boomdp_jax.core.compile_time import CompileClock
-from boomdp_jax.physics import prepare_step, rollout, step
+from boomdp_jax.physics import Actuator, prepare_step, rollout, step
+from boomdp_jax.physics.motion import motion_of, state_of
+from boomdp_jax.physics.step import next_motion
 from tests.physics.scenes import make_params, make_scene, make_state
 from tests.reference.planar_dynamics import Pin, Wheel, World
 
@@ -59,6 +63,37 @@ def test_without_jit_nothing_is_compiled_twice():
         np.testing.assert_array_equal(run(), expected)
     assert first.seconds > 0.0
     assert again.seconds == 0.0
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {},
+        {
+            "actuator": Actuator(
+                gain=jnp.array([0.8]), bias=jnp.array([[0.1, 0.2, 0.3]])
+            )
+        },
+        {"center_of_mass": jnp.array([[0.05, -0.02]])},
+    ],
+    ids=["plain", "actuator", "center of mass"],
+)
+def test_a_prepared_step_number_by_number_is_the_same(more):
+    scene, params, state = start(PINNED)
+    params = dataclasses.replace(params, **more)
+    push = jnp.asarray(PUSH)
+
+    @jax.jit
+    def both(scene, params, state, push):
+        prepared = prepare_step(scene, params)
+        motion = motion_of(prepared(state, push)[0])
+        return prepared(state_of(motion, 1), push)[0], next_motion(
+            prepared, motion, push
+        )
+
+    expected, found = both(scene, params, state, push)
+    assert_close(state_of(found, 1), expected, atol=1e-14)
+    assert np.max(np.abs(expected.twist)) > 1e-3
 
 
 def test_rollout_equals_a_loop_of_steps_with_the_cache_handed_on():
