@@ -13,14 +13,17 @@ what is fixed, by the longer side; mass, by the true one (that of a fixed thing 
 be told).
 """
 
+import json
 import sys
 import time
+from pathlib import Path
 
 import jax
 import numpy as np
 from _joint_objects import KINDS, JointObject, handled, random_object, scene_of
 from _report import Reporter, parser_of
 
+from boomdp_jax.core.atomic import atomic_write
 from boomdp_jax.inference.infer import infer_batch
 from boomdp_jax.inference.summary import axial_difference
 
@@ -33,6 +36,12 @@ def main() -> None:
     parser.add_argument("--objects", type=int, default=240, help="over all kinds")
     parser.add_argument("--batch", type=int, default=48, help="objects in one call")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--keep",
+        type=Path,
+        metavar="FOLDER",
+        help="write what was found in each batch there, and go on with what is missing",
+    )
     arguments = parser.parse_args()
     reporter = Reporter(arguments.out)
     num = 3 if arguments.quick else arguments.objects
@@ -42,19 +51,21 @@ def main() -> None:
     for begin in range(0, num, batch):
         # The last batch is filled up, so that all share one compiled call.
         chosen = [objects[i % num] for i in range(begin, begin + batch)]
-        start = time.perf_counter()
-        posteriors = infer_batch(
-            jax.random.key(arguments.seed + begin),
-            [scene_of(thing) for thing, _ in chosen],
-            [history for _, history in chosen],
-            progress=True,
-        )
-        seconds.append(time.perf_counter() - start)
-        for place, ((thing, _), posterior) in enumerate(
-            zip(chosen, posteriors, strict=True)
-        ):
-            results.append(score(thing, posterior))
-            note_failure(begin + place, results[-1])
+        found = None
+        if arguments.keep is not None:
+            names = [f"{key}-{getattr(arguments, key)}" for key in ("seed", "batch")]
+            found = arguments.keep / f"{'-'.join(names)}-from-{begin}.json"
+        if found is not None and found.exists():
+            kept = json.loads(found.read_text(encoding="utf-8"))
+        else:
+            kept = of_batch(chosen, arguments.seed + begin)
+            if found is not None:
+                found.parent.mkdir(exist_ok=True)
+                atomic_write(found, json.dumps(kept).encode())
+        seconds.append(kept["seconds"])
+        for place, result in enumerate(kept["results"]):
+            results.append(result)
+            note_failure(begin + place, result)
     results = results[:num]
     report_all(reporter, results)
     # The first call compiles.
@@ -74,6 +85,23 @@ def main() -> None:
         unit="s",
     )
     reporter.print_table()
+
+
+def of_batch(chosen: list[tuple], seed: int) -> dict:
+    """Scores of some objects, and how long their inference took."""
+    start = time.perf_counter()
+    posteriors = infer_batch(
+        jax.random.key(seed),
+        [scene_of(thing) for thing, _ in chosen],
+        [history for _, history in chosen],
+        progress=True,
+    )
+    seconds = time.perf_counter() - start
+    results = [
+        score(thing, posterior)
+        for (thing, _), posterior in zip(chosen, posteriors, strict=True)
+    ]
+    return {"seconds": seconds, "results": results}
 
 
 def make_objects(num: int, seed: int) -> list[tuple]:
@@ -101,9 +129,9 @@ def score(thing: JointObject, posterior) -> dict:
         errors = errors_of(thing, draws, weights[chosen] / weights[chosen].sum())
     return {
         "kind": thing.kind,
-        "is_right": max(probability, key=probability.get) == kind,
+        "is_right": max(probability, key=lambda name: probability[name]) == kind,
         "probability": probability[kind],
-        "errors": errors,
+        "errors": {name: float(error) for name, error in errors.items()},
         "is_ok": posterior.diagnostics["ok"],
         "reasons": posterior.diagnostics["reasons"],
     }

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import boomdp_jax.physics.lone_step as lone_step
 import boomdp_jax.physics.prepare as preparation
 import boomdp_jax.physics.velocity_search as general
 from boomdp_jax.physics import Params, State, step
@@ -221,6 +222,22 @@ def test_the_rest_of_a_batch_changes_no_bit():
     found = np.asarray(fast_step(cases[0], *at_rest))
     np.testing.assert_array_equal(found[~is_other], usual[~is_other])
     assert np.mean(np.any(found != usual, axis=(1, 2))[is_other]) > 0.9
+
+
+@pytest.mark.slow
+def test_a_fixed_number_of_iterations_finds_the_same():
+    # What other backends than a CPU do, forwards and in derivatives.
+    cases = draws(seed=5)
+    keys = jax.random.split(jax.random.key(6), NUM_CASES)
+    usual = np.asarray(fast_step(*cases))
+    rate = np.asarray(jax.jit(jax.vmap(forward))(*cases, keys))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lone_step, "_search", lambda body, now, force: (None, body))
+        fixed = np.asarray(jax.jit(jax.vmap(lambda *c: run_step(*c)))(*cases))
+        other = jax.jit(jax.vmap(lambda *c: forward(*c)))(*cases, keys)
+    assert np.quantile(worst_of_each(usual, fixed), 0.99) < 1e-9
+    scale = np.max(np.abs(rate.reshape(NUM_CASES, -1)), axis=1)
+    assert np.quantile(worst_of_each(rate, other) / scale, 0.99) < 1e-7
 
 
 @pytest.mark.slow
