@@ -38,7 +38,7 @@ def _any(is_true):
 def _batched(arguments, dims):
     (is_true,), _ = arguments, dims
     # Axes of the batch are axes like others.
-    return _any_p.bind(is_true), batching.not_mapped
+    return _any_p.bind(is_true), None
 
 
 _any_p.def_impl(_any)
