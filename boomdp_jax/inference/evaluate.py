@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -98,6 +99,42 @@ def _gather_pushed(targets: StructureTarget, owners, gains, action, owner, num, 
 _PUSHED = Program(_gather_pushed, _EVALUATE)
 
 
+def _gather_restarted(targets: StructureTarget, owners, start, owner, num, z):
+    """The same with rows that each start a track, and what they add to its start."""
+    known, *rest = _gather(targets, owners, owner, num, z)
+    data = known.likelihood.data
+    is_used = data.is_used.astype(start.dtype)
+    new = eqx.tree_at(
+        lambda d: (
+            d.is_start,
+            d.is_second,
+            d.start,
+            d.first_mask,
+            d.last_mask,
+            d.steps.next_state,
+        ),
+        data,
+        (
+            jnp.ones_like(is_used),
+            jnp.zeros_like(is_used),
+            start,
+            jnp.zeros_like(start),
+            jnp.broadcast_to(is_used[..., None, None], start.shape),
+            start,
+        ),
+    )
+    if data.weight is not None:
+        new = eqx.tree_at(lambda d: d.weight, new, jnp.ones_like(is_used))
+    likelihood = eqx.tree_at(lambda x: x.data, known.likelihood, new)
+    none = jnp.zeros_like(known.gains.first)
+    unit = jnp.broadcast_to(jnp.eye(none.shape[-1], dtype=none.dtype), none.shape)
+    known = known._replace(likelihood=likelihood, gains=Gains(none, none, none, unit))
+    return known, *rest
+
+
+_RESTARTED = Program(_gather_restarted, _EVALUATE)
+
+
 def log_prior_density(
     targets: StructureTarget, index: np.ndarray, structure: np.ndarray, z: np.ndarray
 ) -> np.ndarray:
@@ -177,6 +214,58 @@ def pushed_innovations(
     Returns:
         Whitened innovations `[list, point, time, 2, body, 6]`.
     """
+    joined = _of_lists(_PUSHED, targets, index, structure, (gains, action), z)
+    num_rows, num_bodies = action.shape[1:3]
+    return joined.reshape(*z.shape[:2], num_rows, 2, num_bodies, 6)
+
+
+def single_steps(
+    targets: StructureTarget,
+    index: np.ndarray,
+    structure: np.ndarray,
+    start: np.ndarray,
+    z: np.ndarray,
+) -> np.ndarray:
+    """Where every row leads from states that are given, whatever was read.
+
+    Args:
+        targets: with a `FilteredLikelihood`, stacked along a leading object axis.
+        index: object of each list.
+        structure: of each list.
+        start: states before the step of each row, `[list, time, body, 6]`.
+        z: coordinates of up to `CHUNK_SIZE` points of each list, `[list, point, dim]`.
+
+    Returns:
+        Change of the state `[list, point, time, body, 6]`, of angles by less than half
+        a turn; zero in rows of which nothing is used.
+    """
+    joined = _of_lists(_RESTARTED, targets, index, structure, (start,), z)
+    num_rows, num_bodies = start.shape[1:3]
+    joined = joined.reshape(*z.shape[:2], num_rows, 2, num_bodies, 6)
+    return -joined[:, :, :, 1]
+
+
+def _of_lists(
+    program: Program,
+    targets: StructureTarget,
+    index: np.ndarray,
+    structure: np.ndarray,
+    own: tuple,
+    z: np.ndarray,
+) -> np.ndarray:
+    """Whitened innovations of lists of points that have something of their own.
+
+    Args:
+        program: takes `own` after the owners.
+        targets: stacked along a leading object axis.
+        index: object of each list.
+        structure: of each list.
+        own: trees of arrays on the host, leading axis `list`.
+        z: `[list, point, dim]`.
+
+    Returns:
+        `[list, point, reading]`.
+    """
     num_lists, num_points, _ = z.shape
     # Shapes of the calls are those of `evaluate_points`, each list a chunk.
     points = np.minimum(np.arange(CHUNK_SIZE), num_points - 1)
@@ -190,15 +279,12 @@ def pushed_innovations(
         inputs.append(
             (
                 owners,
-                jax.tree.map(lambda leaf, rows=rows: leaf[rows].astype(dtype), gains),
-                action[rows].astype(dtype),
+                *jax.tree.map(lambda leaf, rows=rows: leaf[rows].astype(dtype), own),
                 owner,
                 np.array(counts[-1], np.int32),
                 z[rows[owner]][:, points].astype(dtype),
             )
         )
-    calls = run_each(_PUSHED, targets, inputs)
+    calls = run_each(program, targets, inputs)
     found = [call[2][:num] for call, num in zip(calls, counts, strict=True)]
-    joined = np.concatenate(found)[:, :num_points]
-    shape = action.shape[1:3]
-    return joined.reshape(num_lists, num_points, shape[0], 2, shape[1], 6).astype(float)
+    return np.concatenate(found)[:, :num_points].astype(float)

@@ -269,16 +269,40 @@ def normal_equations(
     weight = np.where(np.isfinite(weight), weight, 0.0)[..., _GROUP]
     weight = np.tile(weight.reshape(len(fits.z), -1), (1, u.shape[1] // weight[0].size))
     weighted = jacobian * weight[:, None]
-    prior = in_use & host.is_normal[None]
     gradient = np.einsum("fdr,fr->fd", weighted, np.nan_to_num(u))
-    gradient += np.where(prior, fits.z, 0.0)
     matrix = weighted @ np.swapaxes(jacobian, 1, 2)
-    each = np.arange(dim)
+    return with_prior(host, fits.structure, fits.z, gradient, matrix)
+
+
+def with_prior(
+    host: Host,
+    structure: np.ndarray,
+    z: np.ndarray,
+    gradient: np.ndarray,
+    matrix: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient and Gauss-Newton matrix of points with what the prior adds to them.
+
+    Args:
+        host: of the targets.
+        structure: of each point.
+        z: coordinates of each point, `[point, dim]`.
+        gradient: of minus the log-likelihood.
+        matrix: of it, `[point, dim, dim]`.
+
+    Returns:
+        Both, and rows of coordinates that are not in use are those of the identity.
+    """
+    in_use = host.in_use[structure]
+    prior = in_use & host.is_normal[None]
+    gradient = gradient + np.where(prior, z, 0.0)
+    each = np.arange(z.shape[1])
     # A direction that nothing tells of is as wide as all there are.
     width = np.where(host.period > 0, host.period, np.inf)
+    matrix = matrix.copy()
     matrix[:, each, each] += prior + in_use * 12.0 / width**2
     both = in_use[:, :, None] & in_use[:, None, :]
-    matrix = np.where(both, matrix, np.eye(dim)[None])
+    matrix = np.where(both, matrix, np.eye(z.shape[1])[None])
     return np.where(in_use, gradient, 0.0), matrix
 
 

@@ -3,17 +3,20 @@ r"""A few levels of noise for each structure, and gains for each: noise averaged
 A filter's gains take the ratios of noises as known. So each structure k has some draws
 $\eta_m$ of all noises, and a hypothesis is a structure, coordinates and one of these
 levels. With $L_m$ the likelihood under the gains of level m, $\hat z_k$ the best fit,
-$Z_k = \int p(\eta) L(h \mid k, \hat z_k, \eta)\,d\eta$, and $v_m$ the posterior
-density of $\eta_m$ at that fit over the density by which it was chosen,
+$Z_k = \int p(\eta) L(h \mid k, \hat z_k, \eta)\,d\eta$ and weights $v_m$,
 
 $$L(h \mid k, z, m) = Z_k \, v_m L_m(z) / L_m(\hat z_k),$$
 
-whose mean over levels is the importance estimate of the likelihood with the noise
-integrated out. Levels are chosen in proportion to their own Laplace evidence. At the
+whose mean over levels stands for the likelihood with the noise integrated out. At the
 best fit alone noise would be taken for too small: the larger it is, the more hypotheses
-agree with the readings. Which level a hypothesis has is one coordinate more, uniform
-over one period, of which each level takes an equal part: samplers need to know nothing
-of it.
+agree with the readings. So what each of many draws leaves open is worked out
+(`noise_volume`), they are divided by it into as many parts as there are levels, and a
+level stands for its part: $v_m$ is such that it has the part's Laplace evidence. (Drawn
+at random by that evidence, eight levels gave standard deviations of a pinned box's mass
+that differed by 22 % from key to key from those of all draws, against 3 % so.)
+
+Which level a hypothesis has is one coordinate more, uniform over one period, of which
+each level takes an equal part: samplers need to know nothing of it.
 """
 
 import math
@@ -33,18 +36,16 @@ from boomdp_jax.inference.fit_noise import NoiseDensity
 from boomdp_jax.inference.kalman import Filtered
 from boomdp_jax.inference.laplace_mixture import LaplaceMixture, make_mixture
 from boomdp_jax.inference.noise_level import NoiseFit
-from boomdp_jax.inference.resampling import systematic
+from boomdp_jax.inference.noise_volume import OpenVolumes, open_volumes
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.typical_noise import TypicalNoise
 
-# Draws of the noise of each structure, from which levels are chosen, and those of them
-# of which it is worked out how much they leave open.
-_NUM_DRAWS, _NUM_TRIES = 256, 16
-# Of the regression, in tries.
-_RIDGE = 0.5
-# Power of what noises leave open by which they are chosen. By one they would be chosen
-# as they are likely; the rare ones that leave most open make half of a variance.
-_TILT = 1.4
+# Draws of the noise of each structure, from which levels are chosen.
+_NUM_DRAWS = 256
+# Power of what noises leave open by which they count more than by their mass where
+# they are divided into parts: the rare ones that leave most open make half of a
+# variance.
+_TILT = 0.4
 
 
 class Levelled(NamedTuple):
@@ -242,37 +243,65 @@ def _choose(
     precision: np.ndarray,
     num_levels: int,
 ) -> _Chosen:
-    """Choose levels of a structure from draws of its noise.
-
-    How much each noise leaves open is worked out for some, which are drawn by the root
-    of their weights to reach beyond what is likely at the best fit; from those it is
-    told for all by regression. Levels are then drawn in order of it, systematically.
-    """
+    """Choose levels of a structure from draws of its noise, each for a part of them."""
     targets = typical.found.targets
     k = int(typical.chosen[place])
     vector, log_weight, log_evidence = _draws(rng, typical, place, champion)
 
-    def filters(rows: np.ndarray) -> tuple[NoiseFit, Filtered, StructureTarget]:
-        each, noise = np.full(len(rows), k), NoiseFit.of_vector(vector[rows])
-        z = np.tile(champion, (len(rows), 1))
-        filtered = filter_points(targets, 0 * each, each, z, noise)
-        return noise, filtered, _rowed(targets, each, noise, filtered)
+    def filters(noise: NoiseFit) -> Filtered:
+        each = np.full(len(noise.reading), k)
+        z = np.tile(champion, (len(each), 1))
+        return filter_points(targets, 0 * each, each, z, noise)
 
-    tries = systematic(rng, np.exp(0.5 * log_weight), _NUM_TRIES)
-    volume = _volume(filters(tries)[2], champion, precision)
-    middle, spread = vector[tries].mean(axis=0), vector[tries].std(axis=0) + 1e-6
-    design = np.pad((vector - middle) / spread, ((0, 0), (1, 0)), constant_values=1.0)
-    normal = design[tries].T @ design[tries] + _RIDGE * np.eye(design.shape[1])
-    slope = np.linalg.solve(normal, design[tries].T @ volume)
-    told = np.clip(design @ slope, volume.min(), volume.max())
-    log_share = log_weight + _TILT * told
-    log_share = log_share - np.logaddexp.reduce(log_share)
-    order = np.argsort(told)
-    rows = order[systematic(rng, np.exp(log_share[order]), num_levels)]
-    noise, filtered, rowed = filters(rows)
-    offset = log_evidence + log_weight[rows] - log_share[rows]
+    middle = typical.found.noise.take(np.array([k]))
+    track = middle, filters(middle)
+    noise = NoiseFit.of_vector(vector)
+    volumes = open_volumes(targets, k, champion, precision, track, noise)
+    log_mass = log_weight + volumes.log_volume
+    rows, log_share = _parts(log_mass, volumes, num_levels)
+    noise = noise.take(rows)
+    filtered = filters(noise)
+    rowed = _rowed(targets, np.full(num_levels, k), noise, filtered)
+    # So that each comes to have what its part has.
+    offset = log_evidence + log_share + math.log(num_levels)
+    offset = offset - _volume(rowed, champion, precision)
     offset = offset - _log_likelihood(rowed, champion)
     return _Chosen(noise, filtered, offset, log_evidence)
+
+
+def _parts(
+    log_mass: np.ndarray, volumes: OpenVolumes, num_levels: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Divide noises by how much they leave open, and choose one of each part.
+
+    A noise may lie in several parts.
+
+    Args:
+        log_mass: of each noise, all the posterior that it has.
+        volumes: of each noise.
+        num_levels: how many parts.
+
+    Returns:
+        For each part, the noise whose variances are most like its mean ones, and the
+        logarithm of its mass.
+    """
+    order = np.argsort(volumes.log_volume)
+    mass = np.exp(log_mass[order] - log_mass.max())
+    open_ = volumes.log_volume[order]
+    variance = volumes.variance[order]
+    tilted = mass * np.exp(_TILT * (open_ - open_[-1]))
+    end = np.cumsum(tilted) / tilted.sum()
+    begin = np.concatenate([[0.0], end[:-1]])
+    bounds = np.arange(num_levels + 1)[:, None] / num_levels
+    within = np.minimum(end, bounds[1:]) - np.maximum(begin, bounds[:-1])
+    share = np.maximum(within, 0.0) / np.maximum(end - begin, 1e-300)
+    share = share * mass
+    total = share.sum(axis=1)
+    mean = (share / total[:, None]) @ variance
+    gap = np.log(variance)[None] - np.log(mean)[:, None]
+    gap = np.where(share > 0.0, np.sum(gap**2, axis=-1), np.inf)
+    log_total = np.log(total) + log_mass.max()
+    return order[np.argmin(gap, axis=1)], log_total
 
 
 def _draws(
