@@ -17,6 +17,9 @@ from boomdp_jax.inference.laplace_mixture import LaplaceMixture
 from boomdp_jax.inference.noise import Noise, draw_noise
 from boomdp_jax.inference.target import StructureTarget
 
+# Draws that are worked at side by side.
+_AT_A_TIME = 256
+
 
 class ImportanceEvidence(eqx.Module):
     """Evidence and probability of every structure, and the weighted draws behind."""
@@ -145,7 +148,11 @@ def draws_of_noise(
         log_proposal = mixture.log_density(target, drawn.structure, drawn.z)
         return ImportanceDraws(drawn.structure, drawn.z, log_proposal, drawn.is_inside)
 
-    return jax.vmap(draw)(noise, component)
+    # Every draw needs the components of its structure, which for all draws at once are
+    # much to hold.
+    return jax.lax.map(
+        lambda each: draw(*each), (noise, component), batch_size=_AT_A_TIME
+    )
 
 
 def weigh_draws(

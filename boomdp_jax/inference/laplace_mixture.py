@@ -58,12 +58,19 @@ class LaplaceMixture(eqx.Module):
     """Cholesky factor of the precision of each slot's coordinates given all others."""
     block_whitening: Float[Array, "component dim dim"]
     """Inverse of `block_tril`."""
+    members: Int[Array, "structure member"] | None = None
+    """Components of each structure, padded with -1; None: not known."""
     degrees_of_freedom: int = eqx.field(static=True, default=6)
 
     @property
     def num_components(self) -> int:
         """How many components there are, padding included."""
         return self.structure.shape[-1]
+
+    @property
+    def most_each(self) -> int | None:
+        """For how many components of a structure there is room; None: not known."""
+        return None if self.members is None else self.members.shape[-1]
 
     def sample(self, key: Key, target: StructureTarget) -> MixtureDraw:
         """Draw a structure and its coordinates."""
@@ -90,7 +97,22 @@ class LaplaceMixture(eqx.Module):
         self, target: StructureTarget, structure: IntScalar, z: Float[Array, " dim"]
     ) -> FloatScalar:
         """Log-density of a structure and its coordinates."""
-        return logsumexp(self.component_log_density(target, structure, z))
+        own = self.of_structure(structure)
+        return logsumexp(own.component_log_density(target, structure, z))
+
+    def of_structure(self, structure: IntScalar) -> "LaplaceMixture":
+        """The components of a structure alone, where it is known which they are.
+
+        A mixture has components of all structures, of which a density needs a few. The
+        weights stay those in the whole mixture.
+        """
+        if self.members is None:
+            return self
+        bare = eqx.tree_at(lambda m: m.members, self, None)
+        rows = self.members[structure]
+        own = jax.tree.map(lambda leaf: leaf[jnp.maximum(rows, 0)], bare)
+        log_weight = jnp.where(rows >= 0, own.log_weight, -jnp.inf)
+        return eqx.tree_at(lambda m: m.log_weight, own, log_weight)
 
     def component_log_density(
         self, target: StructureTarget, structure: IntScalar, z: Float[Array, " dim"]
@@ -142,6 +164,7 @@ def make_mixture(
     *,
     from_prior: Bool[Array, "component dim"] | None = None,
     degrees_of_freedom: int = 6,
+    most_each: int | None = None,
 ) -> LaplaceMixture:
     """Complete a mixture with the factors that its density needs.
 
@@ -155,6 +178,8 @@ def make_mixture(
         from_prior: coordinates to draw from the prior; default: none.
         degrees_of_freedom: of the Student distributions. Five to eight bound the
             importance weights without wasting proposals.
+        most_each: most components of a structure that are no padding, where that is
+            known; densities then leave those of other structures alone.
 
     Returns:
         The mixture. Give every structure at least one component, or jumps cannot
@@ -183,8 +208,28 @@ def make_mixture(
         log_normaliser=student_log_peak(degrees_of_freedom, num_student) - log_volume,
         block_tril=block_tril,
         block_whitening=block_whitening,
+        members=None
+        if most_each is None
+        else _members(structure, log_weight, target.num_structures, most_each),
         degrees_of_freedom=degrees_of_freedom,
     )
+
+
+def _members(
+    structure: Int[Array, " component"],
+    log_weight: Float[Array, " component"],
+    num_structures: int,
+    most_each: int,
+) -> Int[Array, "structure member"]:
+    """Components of each structure that are no padding, the rest -1."""
+    name = jnp.where(log_weight > -jnp.inf, structure, num_structures)
+    order = jnp.argsort(name, stable=True).astype(jnp.int32)
+    name = name[order]
+    each = jnp.arange(num_structures, dtype=name.dtype)
+    place = jnp.searchsorted(name, each)[:, None] + jnp.arange(most_each)[None]
+    row = jnp.minimum(place, len(order) - 1)
+    is_own = (name[row] == each[:, None]) & (place < len(order))
+    return jnp.where(is_own, order[row], -1)
 
 
 def student_log_peak(

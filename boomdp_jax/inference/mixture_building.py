@@ -20,6 +20,7 @@ def laplace_mixture(
     *,
     widening: float = 1.0,
     degrees_of_freedom: int = 6,
+    most_each: int | None = None,
 ) -> LaplaceMixture:
     r"""Put a component on each mode, weighed by its Laplace evidence.
 
@@ -37,6 +38,7 @@ def laplace_mixture(
         log_density: of the target at the mode; minus infinity drops the mode.
         widening: factor on the scale of every component.
         degrees_of_freedom: of the Student components.
+        most_each: most modes of a structure, where that is known.
 
     Returns:
         The mixture. A mode with a precision that is not positive definite is dropped.
@@ -58,6 +60,7 @@ def laplace_mixture(
         widening * jnp.where(is_usable[:, None, None], scale_tril, identity),
         jnp.where(is_usable, log_weight, -jnp.inf),
         degrees_of_freedom=degrees_of_freedom,
+        most_each=most_each,
     )
 
 
@@ -109,6 +112,7 @@ def add_slot_components(
         target,
         _weighted(mixture, mixture.log_weight + jnp.log1p(-share)[mixture.structure]),
         _weighted(new, jnp.where(is_valid, new_weight[structure], -jnp.inf)),
+        num_slots * num_modes,
     )
 
 
@@ -138,6 +142,7 @@ def add_prior_components(
         target,
         _weighted(mixture, mixture.log_weight + jnp.log1p(-total_weight)),
         _weighted(prior, prior.log_weight + jnp.log(total_weight)),
+        1,
     )
 
 
@@ -156,7 +161,7 @@ def add_spare_components(
         degrees_of_freedom=mixture.degrees_of_freedom,
     )
     padding = jnp.full(num_structures, -jnp.inf, dtype)
-    return _concatenate(target, mixture, _weighted(spare, padding))
+    return _concatenate(target, mixture, _weighted(spare, padding), 1)
 
 
 def fit_spare_components(
@@ -191,6 +196,7 @@ def fit_spare_components(
         kept.at[-num:].set(jnp.where(is_used, new, -jnp.inf)),
         from_prior=mixture.from_prior,
         degrees_of_freedom=mixture.degrees_of_freedom,
+        most_each=mixture.most_each,
     )
 
 
@@ -220,8 +226,13 @@ def refine_weights(
     """
 
     def share(k: Array, point: Array) -> Array:
-        each = mixture.component_log_density(target, k, point)
-        return jnp.exp(each - logsumexp(each))
+        own = mixture.of_structure(k)
+        each = own.component_log_density(target, k, point)
+        shares = jnp.exp(each - logsumexp(each))
+        if mixture.members is None:
+            return shares
+        # What is padding has no share, wherever it goes.
+        return jnp.zeros_like(mixture.log_weight).at[mixture.members[k]].add(shares)
 
     weight = jnp.exp(log_weight - logsumexp(log_weight))
     shares = jax.vmap(share)(structure, z)
@@ -280,7 +291,8 @@ def _like(
     is_added: Bool[Array, "new dim"],
 ) -> LaplaceMixture:
     """Copies for other structures, with the added coordinates from the prior."""
-    copy = jax.tree.map(lambda leaf: leaf[base], mixture)
+    bare = eqx.tree_at(lambda m: m.members, mixture, None, is_leaf=lambda x: x is None)
+    copy = jax.tree.map(lambda leaf: leaf[base], bare)
     return eqx.tree_at(
         lambda new: (new.structure, new.from_prior),
         copy,
@@ -295,15 +307,18 @@ def _weighted(
 
 
 def _concatenate(
-    target: StructureTarget, first: LaplaceMixture, second: LaplaceMixture
+    target: StructureTarget, first: LaplaceMixture, second: LaplaceMixture, more: int
 ) -> LaplaceMixture:
-    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
+    """Two mixtures as one, the second of at most so many components a structure."""
+
+    def both(name: str) -> Array:
+        return jnp.concatenate([getattr(first, name), getattr(second, name)])
+
+    most = first.most_each
     return make_mixture(
         target,
-        both.structure,
-        both.mean,
-        both.scale_tril,
-        both.log_weight,
-        from_prior=both.from_prior,
-        degrees_of_freedom=both.degrees_of_freedom,
+        *(both(name) for name in ("structure", "mean", "scale_tril", "log_weight")),
+        from_prior=both("from_prior"),
+        degrees_of_freedom=first.degrees_of_freedom,
+        most_each=None if most is None else most + more,
     )

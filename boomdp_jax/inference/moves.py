@@ -163,6 +163,7 @@ def propose_walk(
     component reversible, and so does drawing the component anew leave the mixture.
     Coordinates from the prior move likewise about zero, angles by a uniform step.
     """
+    mixture = mixture.of_structure(point.structure)
     each = mixture.component_log_density(target, point.structure, point.z)
     component = pick(each, noise.choice[0])
     is_student = mixture.is_student[component]

@@ -220,6 +220,7 @@ def mixtures_over_levels(
             mixture.log_weight,
             from_prior=jnp.pad(mixture.from_prior, end, constant_values=True),
             degrees_of_freedom=mixture.degrees_of_freedom,
+            most_each=mixture.most_each,
         )
 
     return jax.vmap(one)(targets, mixtures)

@@ -98,6 +98,7 @@ def fit_mixture(block: BlockBelief) -> LaplaceMixture:
         within + jnp.log(mixed)[structure],
         from_prior=mixture.from_prior,
         degrees_of_freedom=mixture.degrees_of_freedom,
+        most_each=mixture.most_each,
     )
 
 

@@ -59,6 +59,7 @@ def sample_slot(
         The coordinates with the block filled in, and whether the draw counts (an angle
         may have fallen out of its component's cell).
     """
+    mixture = mixture.of_structure(structure)
     split = _split(target, mixture, structure, z, block)
     component = pick(split.log_weight, noise.choice[0])
     student = block & mixture.is_student[component]
@@ -87,6 +88,7 @@ def slot_log_density(
     prior_share: float,
 ) -> FloatScalar:
     """Log-density with which `sample_slot` draws the block of `z`; 0 if it is empty."""
+    mixture = mixture.of_structure(structure)
     split = _split(target, mixture, structure, z, block)
     log_prior = coordinate_log_prior(target, z)
     student = block[None] & mixture.is_student

@@ -63,9 +63,14 @@ class StructureDraws(NamedTuple):
 def start_mixtures(targets: StructureTarget, modes: Modes) -> LaplaceMixture:
     """Proposal mixtures: fitted modes, modes times priors, and the prior."""
 
-    def one(target, modes):
+    def one(target: StructureTarget, modes: Modes) -> LaplaceMixture:
         mixture = laplace_mixture(
-            target, modes.structure, modes.z, modes.precision, modes.log_density
+            target,
+            modes.structure,
+            modes.z,
+            modes.precision,
+            modes.log_density,
+            most_each=len(modes.structure) // target.num_structures,
         )
         mixture = add_slot_components(target, mixture, total_weight=0.4)
         mixture = add_prior_components(target, mixture, total_weight=0.02)

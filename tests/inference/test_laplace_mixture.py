@@ -57,6 +57,52 @@ def student(mixture, component, coordinates):
     return stats.multivariate_t(mean, shape, df=FREEDOM)
 
 
+def test_components_of_other_structures_change_nothing():
+    """Nor does it matter in which order they come, and how much room there is."""
+    target = make_target(two_sided)
+    whole = random_mixture(target, num_each=3)
+    order = np.random.default_rng(5).permutation(whole.num_components)
+    weight = np.array(whole.log_weight)[order]
+    weight[::7] = -np.inf
+    parts = (whole.structure[order], whole.mean[order], whole.scale_tril[order])
+
+    def made(**more):
+        mixture = make_mixture(
+            target, *parts, jnp.asarray(weight), degrees_of_freedom=FREEDOM, **more
+        )
+        return add_prior_components(target, add_slot_components(target, mixture))
+
+    plain, sorted_ = made(), made(most_each=3)
+    assert plain.members is None
+    assert sorted_.members.shape == (len(STRUCTURES), 3 + STRUCTURES.shape[1] + 1)
+    rows = np.asarray(sorted_.members)
+    seen = np.sort(rows[rows >= 0])
+    expected = np.flatnonzero(np.asarray(sorted_.log_weight) > -np.inf)
+    np.testing.assert_array_equal(seen, expected)
+    own = np.asarray(sorted_.structure)[rows] == np.arange(len(rows))[:, None]
+    assert np.all(own[rows >= 0])
+
+    @eqx.filter_jit
+    def values(mixture, k, z, block):
+        noise = draw_noise(jax.random.key(0), SLOT.size, FREEDOM)
+        return (
+            mixture.log_density(target, k, z),
+            slot_log_density(target, mixture, k, z, block, 0.2),
+            sample_slot(noise, target, mixture, k, z, block, 0.2)[0],
+        )
+
+    rng = np.random.default_rng(6)
+    for k in range(len(STRUCTURES)):
+        z = jnp.asarray(np.where(in_use(k), rng.normal(size=SLOT.size), 0.0))
+        slot = SLOT[in_use(k)][-1] if in_use(k).any() else 0
+        block = jnp.asarray((SLOT == slot) & in_use(k))
+        arguments = (jnp.asarray(k), z, block)
+        for a, b in zip(
+            values(plain, *arguments), values(sorted_, *arguments), strict=True
+        ):
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+
+
 @pytest.mark.slow
 def test_log_density_is_a_mixture_of_student_densities(precision):
     target = make_target(NoLikelihood())

@@ -150,9 +150,9 @@ def test_a_belief_agrees_with_inference_on_all_rows_at_once(online, name):
         assert abs(difference) < 0.12, structure
     mass, expected = (x.to_json()["bodies"]["box"]["mass"] for x in (posterior, batch))
     assert abs(mass["q50"] - expected["q50"]) < 0.5 * expected["sd"]
-    # Noise is averaged over in eight levels, and much depends on it in this pinned world:
-    # by its key the belief came out 0.78 to 1.16 times as wide as `infer`; with one level
-    # at 0.42. With noise fixed at the truth in both they agree within 5 %.
+    # Noise is averaged over in eight levels, and much depends on it in this pinned
+    # world: by its key the belief came out 0.78 to 1.16 times as wide as `infer`; with
+    # one level at 0.42. With noise fixed at the truth in both they agree within 5 %.
     assert 0.5 < mass["sd"] / expected["sd"] < 1.5
 
 
