@@ -39,6 +39,11 @@ _START_NOISE = 3.0
 _MOST_FITTED = 8
 # So many nats below the best a structure is out of the question.
 _HOPELESS = 40.0
+# So many nats for each reading below the best single steps of another, a structure gets
+# no filter of its own. Where one is wrong, noise of starts may pass for what it lacks:
+# a velocity whose readings are all noise is best predicted by none, which gains half of
+# the logarithm of two for each.
+_LACK = 0.5
 # Sds by which gains take the motion's noise to be above its peak.
 _WIDENING = 1.0
 
@@ -74,7 +79,7 @@ def find_modes(
     rng = host_generator(key)
     guesses = Guesses.of(targets)
     report("fitting single steps")
-    fits = _single_step_fits(rng, targets, guesses, settings)
+    fits, lack = _single_step_fits(rng, targets, guesses, settings)
     noise = _first_noise(targets, best_of_each(fits, num_structures, 1))
     for number in range(_NUM_ROUNDS):
         report(f"fitting noise and filters, round {number + 1} of {_NUM_ROUNDS}")
@@ -85,12 +90,11 @@ def find_modes(
         again = best_of_each(again, num_structures, settings.num_starts)
         if number > 0:
             # Gains have changed a little, and what there is to find has been found.
-            fits = climb(targets, again, settings.num_repeats)
+            fits = climb(targets, again, settings.num_repeats, lack)
             continue
-        fits = climb(targets, again, settings.num_iterations)
-        grown = grown_fits(rng, targets, guesses, fits, settings)
-        fits = join_fits(fits, climb(targets, grown, settings.num_iterations))
-    return Found(targets, collect_modes(targets, fits, settings.num_modes), noise)
+        fits = _climbed(rng, targets, guesses, again, settings, lack)
+    modes = collect_modes(targets, fits, settings.num_modes, lack)
+    return Found(targets, modes, noise)
 
 
 def find_single_step_modes(
@@ -107,8 +111,8 @@ def find_single_step_modes(
         Up to `num_modes` modes per structure and object.
     """
     rng = host_generator(key)
-    fits = _single_step_fits(rng, targets, Guesses.of(targets), settings)
-    return collect_modes(targets, fits, settings.num_modes)
+    fits, lack = _single_step_fits(rng, targets, Guesses.of(targets), settings)
+    return collect_modes(targets, fits, settings.num_modes, lack)
 
 
 def find_modes_of_exact_starts(
@@ -137,15 +141,13 @@ def find_modes_of_exact_starts(
     rng = host_generator(key)
     guesses = Guesses.of(targets)
     report("fitting single steps")
-    fits = _single_step_fits(rng, targets, guesses, settings)
+    fits, lack = _single_step_fits(rng, targets, guesses, settings)
     if starts.horizon != 1:
         report("fitting open loops")
         targets = with_open_loop(targets, starts)
         again = make_fits(targets, fits.index, fits.structure, fits.z)
-        fits = climb(targets, again, settings.num_iterations)
-        grown = grown_fits(rng, targets, guesses, fits, settings)
-        fits = join_fits(fits, climb(targets, grown, settings.num_iterations))
-    return targets, collect_modes(targets, fits, settings.num_modes)
+        fits = _climbed(rng, targets, guesses, again, settings, lack)
+    return targets, collect_modes(targets, fits, settings.num_modes, lack)
 
 
 def _single_step_fits(
@@ -153,12 +155,34 @@ def _single_step_fits(
     targets: StructureTarget,
     guesses: Guesses,
     settings: FitSettings,
-) -> Fits:
-    """Fits from anywhere, and from fits of smaller structures."""
+) -> tuple[Fits, np.ndarray]:
+    """Fits from anywhere, and how much below the best of an object is worth a filter.
+
+    Structures that lack more keep the fits that they have got.
+    """
     starts = first_fits(rng, targets, guesses, settings)
-    fits = climb(targets, starts, settings.num_iterations)
-    grown = grown_fits(rng, targets, guesses, fits, settings)
-    return join_fits(fits, climb(targets, grown, settings.num_iterations))
+    likelihood: Any = targets.log_likelihood
+    num = np.asarray(likelihood.data.steps.mask).sum(axis=(1, 2, 3))
+    lack = np.maximum(_LACK * num, _HOPELESS)
+    fits = _climbed(rng, targets, guesses, starts, settings, lack, from_anywhere=True)
+    return fits, lack
+
+
+def _climbed(
+    rng: np.random.Generator,
+    targets: StructureTarget,
+    guesses: Guesses,
+    starts: Fits,
+    settings: FitSettings,
+    lack: np.ndarray,
+    *,
+    from_anywhere: bool = False,
+) -> Fits:
+    """Climb, and again from what was found of smaller structures."""
+    num = settings.num_iterations
+    fits = climb(targets, starts, num, lack, from_anywhere=from_anywhere)
+    grown = grown_fits(rng, targets, guesses, fits, settings, lack)
+    return join_fits(fits, climb(targets, grown, num, lack))
 
 
 def _first_noise(targets: StructureTarget, top: Fits) -> NoiseFit:

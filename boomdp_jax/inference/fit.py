@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int
 from boomdp_jax.core.arrays import on_device
 from boomdp_jax.inference.draw_moves import wrapped
 from boomdp_jax.inference.evaluate import evaluate_points
+from boomdp_jax.inference.fit_groups import FitGroups
 from boomdp_jax.inference.one_step import NOISE_SHAPE
 from boomdp_jax.inference.target import StructureTarget
 
@@ -27,6 +28,8 @@ _DAMPING_FACTORS = np.array([0.1, 1.0, 10.0])
 _ARRIVED = 1e-3
 # After so many iterations a fit this far below the best of its structure is given up.
 _PATIENCE, _HOPELESS = 3, 25.0
+# A structure is given up, in terms of what it may lack, in a first climb from anywhere.
+_LENIENCE = 2.0
 # Steps of the differences in posterior standard deviations, and their limits in prior
 # ones by float size: above the rounding of the prediction, below its curvature.
 _DIFFERENCE = 0.2
@@ -163,13 +166,24 @@ def _distance(fits: Fits, first: int, second: int) -> float:
     return float(np.sqrt(max(offset @ fits.precision[first] @ offset, 0.0)))
 
 
-def climb(targets: StructureTarget, fits: Fits, num_iterations: int) -> Fits:
+def climb(
+    targets: StructureTarget,
+    fits: Fits,
+    num_iterations: int,
+    lack: np.ndarray | None = None,
+    *,
+    from_anywhere: bool = False,
+) -> Fits:
     """Take points to their optima.
 
     Args:
         targets: with a `FilteredLikelihood`, stacked along a leading object axis.
         fits: where to start.
         num_iterations: most iterations.
+        lack: how much below an object's best fit the best of a structure may be, in
+            nats; those further below stay where they are. None: however much.
+        from_anywhere: whether nothing has been climbed yet; structures then have a few
+            iterations, and twice as much, before they are given up.
 
     Returns:
         The same list, uphill.
@@ -179,10 +193,16 @@ def climb(targets: StructureTarget, fits: Fits, num_iterations: int) -> Fits:
     precision = fits.precision.copy()
     damping = np.full(len(value), 0.1)
     is_moving = np.isfinite(value)
-    best_of = _Best(targets, fits)
+    groups = FitGroups(fits.index, fits.structure, *targets.structures.shape[:2])
+    if lack is not None and not from_anywhere:
+        is_moving &= groups.is_worth(value, lack)
     for iteration in range(num_iterations):
         if iteration >= _PATIENCE:
-            is_moving &= value > best_of(value) - _HOPELESS
+            is_moving &= value > groups.best(value) - _HOPELESS
+            is_moving &= ~groups.is_repeated(value, z, precision, host.wrap)
+            if lack is not None:
+                lenience = _LENIENCE if from_anywhere else 1.0
+                is_moving &= groups.is_worth(value, lenience * lack)
         rows = np.flatnonzero(is_moving)
         if rows.size == 0:
             break
@@ -215,20 +235,6 @@ def climb(targets: StructureTarget, fits: Fits, num_iterations: int) -> Fits:
         has_arrived = is_better & (gain < _ARRIVED) | (damping[rows] > 1e3)
         is_moving[rows] = ~has_arrived
     return Fits(fits.index, fits.structure, z, value, precision)
-
-
-class _Best:
-    """Highest value among the fits of the same object and structure."""
-
-    def __init__(self, targets: StructureTarget, fits: Fits):
-        num_objects, num_structures = targets.structures.shape[:2]
-        self._group = fits.index * num_structures + fits.structure
-        self._num = num_objects * num_structures
-
-    def __call__(self, value: np.ndarray) -> np.ndarray:
-        best = np.full(self._num, -np.inf)
-        np.maximum.at(best, self._group, value)
-        return best[self._group]
 
 
 def normal_equations(
@@ -319,15 +325,34 @@ def _attempts(host: Host, z, gradient, matrix, damping) -> np.ndarray:
     return host.wrap(np.where(np.isfinite(points), points, z[:, None, :]))
 
 
-def collect_modes(targets: StructureTarget, fits: Fits, num_modes: int) -> Modes:
-    """Distinct optima of every structure, padded to equal numbers."""
+def collect_modes(
+    targets: StructureTarget,
+    fits: Fits,
+    num_modes: int,
+    lack: np.ndarray | None = None,
+) -> Modes:
+    """Distinct optima of every structure, padded to equal numbers.
+
+    Args:
+        targets: stacked along a leading object axis.
+        fits: of all structures.
+        num_modes: most of each structure.
+        lack: as for `climb`; structures that lack more have their best fit, as it is.
+    """
     num_objects, num_structures = targets.structures.shape[:2]
     host = Host.of(targets)
     few = best_of_each(fits, num_structures, 2 * num_modes)
+    left = few.take(np.zeros(0, int))
+    if lack is not None:
+        groups = FitGroups(few.index, few.structure, num_objects, num_structures)
+        is_worth = groups.is_worth(few.value, lack)
+        left = best_of_each(few.take(~is_worth), num_structures, 1)
+        few = few.take(is_worth)
     _, matrix = normal_equations(targets, host, few)
     few = best_of_each(
         few._replace(precision=matrix), num_structures, num_modes, min_distance=3.0
     )
+    few = join_fits(few, left)
     dim, total = few.z.shape[1], num_structures * num_modes
     z = np.zeros((num_objects, total, dim))
     precision = np.tile(np.eye(dim), (num_objects, total, 1, 1))

@@ -38,7 +38,6 @@ def first_fits(
     settings: FitSettings,
 ) -> Fits:
     """The best of many starts of every structure, before any climb."""
-    num_structures = targets.structures.shape[1]
     host = Host.of(targets)
     draws = np.stack(
         [
@@ -47,7 +46,8 @@ def first_fits(
         ]
     )
     draws = np.where(host.in_use[None, :, None], draws[:, None], 0.0)
-    return _best_draws(targets, draws, num_structures, settings.num_starts)
+    has_start = np.ones(draws.shape[:2], bool)
+    return _best_draws(targets, draws, has_start, settings.num_starts)
 
 
 def grown_fits(
@@ -56,12 +56,22 @@ def grown_fits(
     guesses: Guesses,
     fits: Fits,
     settings: FitSettings,
+    lack: np.ndarray | None = None,
 ) -> Fits:
     """Starts of every structure from the best fits of structures with one slot less.
 
     The slot's own coordinates come from the prior, or from a guess. A structure that no
     smaller one leads to starts from its own best fit, and so does the first start of
     every structure.
+
+    Args:
+        rng: source of randomness.
+        targets: stacked along a leading object axis.
+        guesses: where constraints would have to be.
+        fits: of all structures.
+        settings: how many starts.
+        lack: as for `climb`; a structure that lacks more, and that none leads to which
+            does not, has no starts. None: all have.
     """
     num_objects, num_structures = targets.structures.shape[:2]
     host = Host.of(targets)
@@ -77,7 +87,12 @@ def grown_fits(
             is_new = host.in_use[k] & ~host.in_use[chosen]
             draws[i, k] = np.where(is_new, block, z[i, chosen])
             draws[i, k, 0] = z[i, k]
-    return _best_draws(targets, draws, num_structures, settings.num_starts)
+    value = best.value.reshape(num_objects, num_structures)
+    is_worth = np.ones(value.shape, bool)
+    if lack is not None:
+        is_worth = value >= value.max(axis=1, keepdims=True) - lack[:, None]
+    has_start = is_worth | np.stack([is_worth[:, p].any(axis=1) for p in parents], 1)
+    return _best_draws(targets, draws, has_start, settings.num_starts)
 
 
 def _parents(targets: StructureTarget, structure: int) -> np.ndarray:
@@ -89,9 +104,11 @@ def _parents(targets: StructureTarget, structure: int) -> np.ndarray:
     return found if found.size else np.array([structure])
 
 
-def _best_draws(targets, draws: np.ndarray, num_structures: int, num: int) -> Fits:
-    num_objects, _, num_draws, dim = draws.shape
-    index = np.repeat(np.arange(num_objects), num_structures * num_draws)
-    structure = np.tile(np.repeat(np.arange(num_structures), num_draws), num_objects)
-    fits = make_fits(targets, index, structure, draws.reshape(-1, dim))
-    return best_of_each(fits, num_structures, num)
+def _best_draws(
+    targets: StructureTarget, draws: np.ndarray, has_start: np.ndarray, num: int
+) -> Fits:
+    """The best few of the draws of each structure `[object, structure, draw, dim]`."""
+    num_draws, dim = draws.shape[2:]
+    index, structure = (np.repeat(part, num_draws) for part in np.nonzero(has_start))
+    fits = make_fits(targets, index, structure, draws[has_start].reshape(-1, dim))
+    return best_of_each(fits, draws.shape[1], num)

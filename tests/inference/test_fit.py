@@ -1,11 +1,13 @@
 """Evaluation in chunks, fits and noise, against plain calls, SciPy and closed forms."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
+from boomdp_jax.core.history import make_history
 from boomdp_jax.inference.block import make_block, stack_blocks
 from boomdp_jax.inference.evaluate import evaluate_points
 from boomdp_jax.inference.find_modes import find_modes
@@ -18,9 +20,11 @@ from boomdp_jax.inference.fit import (
     make_fits,
     normal_equations,
 )
+from boomdp_jax.inference.fit_groups import FitGroups
 from boomdp_jax.inference.fit_noise import fit_noise, with_gains
 from boomdp_jax.inference.noise_level import NoiseFit
 from boomdp_jax.inference.one_step import OneStepLikelihood
+from boomdp_jax.physics import scene_spec_from_dict
 from tests.inference.recordings import AREA, MASS, NOISE, box_scene, free_box
 
 WHEELED = {"wheel": 1}
@@ -59,6 +63,46 @@ def test_points_in_any_order_are_evaluated_as_alone(wheeled):
         return target.log_density(k, z)
 
     expected = [alone(i, k, p) for i, k, p in zip(index, structure, z, strict=True)]
+    np.testing.assert_allclose(found.log_density, expected, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_points_of_a_pair_are_evaluated_as_alone():
+    """Their chunks have points of several structures, and of gains of their own."""
+    rng = np.random.default_rng(3)
+    half = {"type": "box", "half_extents": [0.2, 0.1]}
+    spec = scene_spec_from_dict(
+        {
+            "schema": "planar-scene-1",
+            "dt": 0.02,
+            "bodies": [
+                {"name": "left", "shape": half, "pose": [0.0, 0.0, 0.0]},
+                {"name": "right", "shape": half, "pose": [0.5, 0.0, 0.0]},
+            ],
+            "unknown": {"revolute": 1},
+        }
+    )
+    state = 0.05 * rng.normal(size=(7, 2, 6)) + [0.0] * 6
+    state[:, 1, 0] += 0.5
+    wrench = rng.normal(size=(6, 2, 3))
+    history = make_history(state[:-1], wrench, state[1:], 0.02)
+    targets = stack_blocks([make_block(spec, (0, 1), history)])
+    num_structures = targets.structures.shape[1]
+    assert num_structures > 3
+    gains = jax.tree.map(
+        lambda leaf: leaf * (1.0 + 0.3 * rng.random(leaf.shape)),
+        targets.log_likelihood.gains,
+    )
+    targets = eqx.tree_at(lambda t: t.log_likelihood.gains, targets, gains)
+    index, structure, z = random_points(targets, 90)
+    found = evaluate_points(targets, index, structure, 0.3 * z)
+
+    @jax.jit
+    def alone(k, z):
+        target = jax.tree.map(lambda leaf: leaf[0], targets)
+        return target.log_density(k, z)
+
+    expected = [alone(k, 0.3 * p) for k, p in zip(structure, z, strict=True)]
     np.testing.assert_allclose(found.log_density, expected, rtol=1e-9)
 
 
@@ -118,6 +162,49 @@ def test_a_heading_that_changes_nothing_is_as_wide_as_half_a_turn(wheeled):
     assert heading.sum() == 1
     np.testing.assert_allclose(matrix[0, heading, heading], 12.0 / np.pi**2, rtol=1e-3)
     assert np.linalg.eigvalsh(matrix[0])[0] > 0.9
+
+
+@pytest.mark.slow
+def test_a_structure_that_lacks_too_much_stays_where_it_is(wheeled):
+    index, structure, z = random_points(wheeled, 40)
+    index, z = 0 * index, 0.5 * z
+    fits = make_fits(wheeled, index, structure, z)
+    best = [fits.value[structure == k].max() for k in range(2)]
+    gap = abs(best[1] - best[0])
+    worse = int(np.argmin(best))
+    both = climb(wheeled, fits, 2, np.array([gap + 1.0, 0.0]))
+    for k in range(2):
+        assert np.all(both.value[structure == k] >= fits.value[structure == k])
+        assert both.value[structure == k].max() > best[k] + 1.0
+    one = climb(wheeled, fits, 2, np.array([gap - 1e-3, 0.0]))
+    left = structure == worse
+    np.testing.assert_array_equal(one.z[left], fits.z[left])
+    np.testing.assert_array_equal(one.z[~left], both.z[~left])
+
+
+def test_fits_are_worth_going_on_with_by_their_structure_and_object():
+    index = np.array([0, 0, 0, 1, 1])
+    structure = np.array([0, 0, 1, 0, 1])
+    value = np.array([-9.0, -1.0, 0.0, -50.0, -60.0])
+    groups = FitGroups(index, structure, 2, 2)
+    np.testing.assert_array_equal(groups.best(value), [-1.0, -1.0, 0.0, -50.0, -60.0])
+    found = groups.is_worth(value, np.array([0.5, 20.0]))
+    np.testing.assert_array_equal(found, [False, False, True, True, True])
+    found = groups.is_worth(value, np.array([2.0, 5.0]))
+    np.testing.assert_array_equal(found, [True, True, True, True, False])
+
+
+def test_fits_lead_to_the_same_place_within_a_third_of_a_standard_deviation():
+    turn = np.array([0.0, 2.0])
+    groups = FitGroups(np.zeros(5, int), np.array([0, 0, 0, 0, 1]), 1, 2)
+    z = np.array([[0.0, 0.99], [0.02, -0.99], [0.02, 0.6], [0.2, 0.99], [0.0, 0.99]])
+    precision = np.tile(np.diag([100.0, 1.0]), (5, 1, 1))
+
+    def wrap(z):
+        return np.where(turn > 0, z - turn * np.round(z / np.maximum(turn, 1e-9)), z)
+
+    found = groups.is_repeated(np.array([5.0, 4, 3, 2, 1]), z, precision, wrap)
+    np.testing.assert_array_equal(found, [False, True, False, False, False])
 
 
 @pytest.mark.slow
