@@ -4,6 +4,10 @@ The points of a chunk share an object and a structure, so that what belongs to t
 read once for a chunk and products with it vectorise. A call of a compiled program takes
 up to `max_chunks()` chunks of up to `MAX_OWNERS` objects and structures, and does as
 much work as there are: the number of chunks is not compiled in.
+
+Where a step costs far more than such products, chunks are filled with points of any
+structures of one object instead: of a pair of bodies there may be a hundred structures
+and a few points of each.
 """
 
 from collections.abc import Callable, Iterator
@@ -19,6 +23,9 @@ CHUNK_SIZE = 64
 
 MAX_OWNERS = 8
 """Pairs of object and structure in one call."""
+
+MAX_MIXED_OWNERS = CHUNK_SIZE
+"""The same where chunks have points of several structures."""
 
 
 def max_chunks() -> int:
@@ -36,7 +43,7 @@ class Call(NamedTuple):
     owners: np.ndarray
     """Object and structure of each owner, `[owner, 2]`, padded."""
     owner: np.ndarray
-    """Owner of each chunk, `[chunk]`, padded."""
+    """Owner of each chunk `[chunk]`, or of each place `[chunk, place]`, padded."""
     num: np.ndarray
     """Chunks that count, a scalar."""
     rows: np.ndarray
@@ -46,11 +53,14 @@ class Call(NamedTuple):
 class Chunking(NamedTuple):
     """Which points go together, and back again; on the host."""
 
-    owner: np.ndarray
-    """Object and structure of each chunk, `[chunk, 2]`."""
+    names: np.ndarray
+    """Objects and structures, in order, `[name, 2]`."""
+    number: np.ndarray
+    """Which of them each place has, `[chunk, place]`."""
     source: np.ndarray
     """Which point fills each place, `[chunk, place]`; places left over repeat one."""
     num_points: int
+    is_mixed: bool
 
     @classmethod
     def of(
@@ -60,6 +70,7 @@ class Chunking(NamedTuple):
         num_structures: int,
         *,
         size: int = CHUNK_SIZE,
+        is_mixed: bool = False,
     ) -> "Chunking":
         """Sort points by object and structure.
 
@@ -68,23 +79,29 @@ class Chunking(NamedTuple):
             structure: of each point.
             num_structures: of each object.
             size: points of a chunk.
+            is_mixed: whether the points of a chunk share an object only.
         """
         group = index.astype(np.int64) * num_structures + structure
         order = np.argsort(group, kind="stable")
-        names, begins, sizes = np.unique(
-            group[order], return_index=True, return_counts=True
-        )
+        group = group[order]
+        is_new = np.diff(group, prepend=-1) > 0
+        names = np.stack(np.divmod(group[is_new], num_structures), axis=1)
+        shared = index[order] if is_mixed else group
+        _, begins, sizes = np.unique(shared, return_index=True, return_counts=True)
         counts = -(-sizes // size)
-        owner = np.repeat(names, counts)
         firsts = np.cumsum(counts) - counts
-        # Place of each chunk within its group, in chunks.
-        rank = np.arange(len(owner)) - np.repeat(firsts, counts)
+        # Place of each chunk within what it shares, in chunks.
+        rank = np.arange(counts.sum()) - np.repeat(firsts, counts)
         place = rank[:, None] * size + np.arange(size)
-        is_real = place < np.repeat(sizes, counts)[:, None]
-        begin = np.repeat(begins, counts)[:, None]
-        source = order[begin + np.where(is_real, place, 0)] if len(order) else place
-        pairs = np.stack(np.divmod(owner, num_structures), axis=1)
-        return cls(pairs, source, len(index))
+        place = np.minimum(place, np.repeat(sizes, counts)[:, None] - 1)
+        rows = np.repeat(begins, counts)[:, None] + place
+        number = (np.cumsum(is_new) - 1)[rows]
+        return cls(names, number, order[rows], len(index), is_mixed)
+
+    @property
+    def num_chunks(self) -> int:
+        """How many chunks there are."""
+        return len(self.source)
 
     def calls(self, num_workers: int) -> Iterator[Call]:
         """The chunks dealt out to calls, one after the other.
@@ -93,26 +110,27 @@ class Chunking(NamedTuple):
             num_workers: how many calls can be made at a time; there are as many calls
                 if there are chunks enough.
         """
-        total = len(self.owner)
-        num_places = max_chunks()
+        total, num_places = self.num_chunks, max_chunks()
         most = min(num_places, max(-(-total // num_workers), 1))
-        is_new = np.ones(total, bool)
-        is_new[1:] = np.any(self.owner[1:] != self.owner[:-1], axis=1)
-        number = np.cumsum(is_new) - 1
+        most_owners = MAX_MIXED_OWNERS if self.is_mixed else MAX_OWNERS
         begin = 0
         while begin < total:
-            end = min(begin + most, total)
-            within = number[begin:end] - number[begin]
-            num = int(np.searchsorted(within, MAX_OWNERS))
+            base = self.number[begin, 0]
+            within = self.number[begin : begin + most] - base
+            num = int(np.searchsorted(within[:, -1], most_owners))
             within = within[:num]
-            first = begin + np.flatnonzero(np.diff(within, prepend=-1))
-            owners = np.resize(self.owner[first], (MAX_OWNERS, 2))
-            owners[len(first) :] = self.owner[begin]
+            count = int(within[-1, -1]) + 1
+            owners = np.tile(self.names[base], (most_owners, 1))
+            owners[:count] = self.names[base : base + count]
             chunk = np.minimum(begin + np.arange(num_places), begin + num - 1)
-            owner = np.zeros(num_places, np.int32)
+            owner = np.zeros((num_places, within.shape[1]), np.int32)
             owner[:num] = within
-            count = np.array(num, np.int32)
-            yield Call(owners.astype(np.int32), owner, count, self.source[chunk])
+            yield Call(
+                owners.astype(np.int32),
+                owner if self.is_mixed else owner[:, 0],
+                np.array(num, np.int32),
+                self.source[chunk],
+            )
             begin += num
 
     def in_order(self, found: list[np.ndarray]) -> np.ndarray:

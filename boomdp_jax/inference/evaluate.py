@@ -18,12 +18,14 @@ from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.core.spread import Program, num_at_a_time, run_each
 from boomdp_jax.inference.chunking import (
     CHUNK_SIZE,
+    MAX_MIXED_OWNERS,
     MAX_OWNERS,
     Chunking,
     for_each_chunk,
     max_chunks,
 )
-from boomdp_jax.inference.filtered_likelihood import without_gains
+from boomdp_jax.inference.filtered_likelihood import group_sums, without_gains
+from boomdp_jax.inference.one_step import NoiseStatistics
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.tracking import Gains
 
@@ -62,21 +64,38 @@ def _gather(targets: StructureTarget, owners, owner, num, z) -> tuple:
 
 
 def _evaluate_chunks(known: _Known, owner, num, z):
-    """Log-likelihoods of chunks `[chunk, place, dim]`."""
+    """Log-likelihoods of chunks `[chunk, place, dim]`.
 
-    def one_chunk(known: _Known, z):
-        likelihood, gains, reference, active = known
-        log_volume = likelihood.log_volume(gains)
+    Where places have owners of their own, what those have is picked row by row: read
+    for all rows beforehand it would be too much for the caches.
+    """
+    is_mixed = owner.ndim == 2
+    volumes = jax.vmap(lambda own: own.likelihood.log_volume(own.gains))(known)
+    counts = jax.vmap(lambda own: own.likelihood.num_counted(own.gains))(known)
+    by_row = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), known.gains)
+
+    def one_chunk(own: tuple, points: tuple):
+        (likelihood, gains, *rest), (z, place) = own, points
         is_used = likelihood.data.is_used
 
-        def one_point(z):
-            found = likelihood.innovations(z, active, gains, is_used)
-            value = likelihood.log_marginal(found.statistics, log_volume, reference)
-            return value, found.statistics, found.whitened.reshape(-1)
+        def one_point(z, place, active, reference, log_volume, num):
+            picked = (by_row, place) if is_mixed else (gains, None)
+            whitened = likelihood.whitened(z, active, *picked, is_used)
+            statistics = NoiseStatistics(num, group_sums(whitened**2))
+            value = likelihood.log_marginal(statistics, log_volume, reference)
+            return value, statistics, whitened.reshape(-1)
 
-        return jax.vmap(one_point)(z)
+        if is_mixed:
+            rest = [leaf[place] for leaf in (known.active, *others)]
+            return jax.vmap(one_point)(z, place, *rest)
+        return jax.vmap(lambda z: one_point(z, None, *rest))(z)
 
-    return for_each_chunk(one_chunk, known, owner, num, z)
+    others = (known.reference, volumes, counts)
+    owned = (known.likelihood, known.gains, known.active, *others)
+    first = owner
+    if is_mixed:
+        first, owned = owner[:, 0], (known.likelihood, None)
+    return for_each_chunk(one_chunk, owned, first, num, (z, owner if is_mixed else z))
 
 
 _EVALUATE = QuickCompile(_evaluate_chunks)
@@ -135,6 +154,12 @@ def _gather_restarted(targets: StructureTarget, owners, start, owner, num, z):
 _RESTARTED = Program(_gather_restarted, _EVALUATE)
 
 
+def _is_mixed(targets: StructureTarget) -> bool:
+    """Whether a step costs so much that chunks have points of several structures."""
+    likelihood: Any = targets.log_likelihood
+    return likelihood.reference.shape[-2] > 1
+
+
 def log_prior_density(
     targets: StructureTarget, index: np.ndarray, structure: np.ndarray, z: np.ndarray
 ) -> np.ndarray:
@@ -169,7 +194,9 @@ def evaluate_points(
     Returns:
         One row per point, in the order given.
     """
-    chunks = Chunking.of(index, structure, targets.structures.shape[1])
+    num_structures = targets.structures.shape[1]
+    is_mixed = _is_mixed(targets)
+    chunks = Chunking.of(index, structure, num_structures, is_mixed=is_mixed)
     dtype = targets.log_prior.dtype
     dealt = list(chunks.calls(num_at_a_time()))
     inputs = [
@@ -269,20 +296,24 @@ def _of_lists(
     num_lists, num_points, _ = z.shape
     # Shapes of the calls are those of `evaluate_points`, each list a chunk.
     points = np.minimum(np.arange(CHUNK_SIZE), num_points - 1)
-    owner = np.minimum(np.arange(max_chunks()), MAX_OWNERS - 1).astype(np.int32)
+    is_mixed = _is_mixed(targets)
+    most = MAX_MIXED_OWNERS if is_mixed else MAX_OWNERS
+    at_a_time = min(max_chunks(), most)
+    chunk = np.minimum(np.arange(max_chunks()), most - 1).astype(np.int32)
+    owner = np.tile(chunk[:, None], CHUNK_SIZE) if is_mixed else chunk
     dtype = targets.log_prior.dtype
     inputs, counts = [], []
-    for begin in range(0, num_lists, MAX_OWNERS):
-        rows = np.minimum(np.arange(begin, begin + MAX_OWNERS), num_lists - 1)
+    for begin in range(0, num_lists, at_a_time):
+        rows = np.minimum(np.arange(begin, begin + most), num_lists - 1)
         owners = np.stack([index[rows], structure[rows]], axis=1).astype(np.int32)
-        counts.append(min(MAX_OWNERS, num_lists - begin))
+        counts.append(min(at_a_time, num_lists - begin))
         inputs.append(
             (
                 owners,
                 *jax.tree.map(lambda leaf, rows=rows: leaf[rows].astype(dtype), own),
                 owner,
                 np.array(counts[-1], np.int32),
-                z[rows[owner]][:, points].astype(dtype),
+                z[rows[chunk]][:, points].astype(dtype),
             )
         )
     calls = run_each(program, targets, inputs)

@@ -76,15 +76,35 @@ class FilteredLikelihood(eqx.Module):
         is_used: Bool[Array, " time"] | None = None,
     ) -> Innovations:
         """Whitened innovations at a hypothesis, and their sums of squares."""
-        params, data = self.coordinates(z, active), self.data
-        whitened = innovations(self.coordinates.world, params, data, gains, is_used)
-        weight = self.data.weight
-        if weight is not None:
-            whitened = whitened * jnp.sqrt(weight)[:, None, None, None]
+        whitened = self.whitened(z, active, gains, None, is_used)
         return Innovations(
             whitened,
             NoiseStatistics(self.num_counted(gains), group_sums(whitened**2)),
         )
+
+    def whitened(
+        self,
+        z: Float[Array, " dim"],
+        active: Bool[Array, " slot"],
+        gains: Gains,
+        place: IntScalar | None,
+        is_used: Bool[Array, " time"] | None = None,
+    ) -> Float[Array, "time 2 body 6"]:
+        """Whitened innovations at a hypothesis, as often as rows count.
+
+        Args:
+            z: coordinates.
+            active: slots.
+            gains: of its structure; of many, after the axis of time, if it has a place.
+            place: which of those it has.
+            is_used: as `scan_used` has it.
+        """
+        params, data = self.coordinates(z, active), self.data
+        world = self.coordinates.world
+        found = innovations(world, params, data, gains, is_used, place)
+        if data.weight is None:
+            return found
+        return found * jnp.sqrt(data.weight)[:, None, None, None]
 
     def num_counted(self, gains: Gains) -> Float[Array, "body 4"]:
         """How many innovations of each channel group count."""

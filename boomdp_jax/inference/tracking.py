@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from boomdp_jax.core.arrays import FloatScalar, on_device
+from boomdp_jax.core.arrays import FloatScalar, IntScalar, on_device
 from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.inference.contact_prediction import (
     ContactScene,
@@ -223,6 +223,7 @@ def innovations(
     data: TrackData,
     gains: Gains,
     is_used: Bool[Array, " time"] | None = None,
+    place: IntScalar | None = None,
 ) -> Float[Array, "time 2 body 6"]:
     """Whitened innovations of all readings, zero where nothing was read.
 
@@ -232,6 +233,8 @@ def innovations(
         data: the block's readings.
         gains: of the hypothesis's structure.
         is_used: as `scan_used` has it.
+        place: which of many gains, whose axis comes after that of time; None: there is
+            but one.
 
     Returns:
         Of the reading that a row starts from and of the one that it ends at;
@@ -243,9 +246,13 @@ def innovations(
         predict = predictor(scene, params, dt)
 
         def advance(state, inputs):
-            return track_row(predict, state, *inputs)
+            row, gains = inputs
+            if place is not None:
+                gains = jax.tree.map(lambda leaf: leaf[place], gains)
+            return track_row(predict, state, row, gains)
 
         return scan_used(advance, jnp.zeros(shape), (data.rows, gains), is_used)[1]
+    assert place is None
     predict_channels = channel_predictor(scene, params, dt)
 
     # Channel by channel from row to row: a batch of points is then a vector for each,
@@ -338,7 +345,8 @@ def _apply(matrix, vector: Float[Array, "body 6"], *, is_lower: bool = False):
     flat = vector.reshape(-1)
     num = flat.shape[0]
     if num > _MAX_WRITTEN_OUT:
-        return (matrix @ flat).reshape(vector.shape)
+        # Not as a product of matrices, which in a batch of those are taken one by one.
+        return jnp.sum(matrix * flat[None], axis=1).reshape(vector.shape)
     rows = []
     for i in range(num):
         terms = [matrix[i, j] * flat[j] for j in range(i + 1 if is_lower else num)]

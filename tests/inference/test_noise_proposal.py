@@ -7,6 +7,8 @@ import pytest
 from scipy.stats import kstest, multivariate_t
 
 from boomdp_jax.inference.chunking import (
+    CHUNK_SIZE,
+    MAX_MIXED_OWNERS,
     MAX_OWNERS,
     Chunking,
     for_each_chunk,
@@ -60,30 +62,40 @@ def test_draws_follow_their_group(proposal):
             assert kstest(own @ direction, theirs @ direction).pvalue > 1e-4
 
 
+@pytest.mark.parametrize("is_mixed", [False, True], ids=["of one", "mixed"])
 @pytest.mark.parametrize("num_workers", [1, 2, 7])
 @pytest.mark.parametrize("num_points", [0, 1, 31, 500, 3000])
-def test_every_point_gets_its_own_result(num_points, num_workers):
+def test_every_point_gets_its_own_result(num_points, num_workers, is_mixed):
     rng = np.random.default_rng(num_points)
+    num_structures = 200 if is_mixed else 7
     index = rng.integers(0, 3, num_points)
-    structure = rng.integers(0, 7, num_points)
+    structure = rng.integers(0, num_structures, num_points)
     value = rng.normal(size=num_points)
-    chunks = Chunking.of(index, structure, 7)
+    chunks = Chunking.of(index, structure, num_structures, is_mixed=is_mixed)
+    most_owners = MAX_MIXED_OWNERS if is_mixed else MAX_OWNERS
     found, sizes = [], []
     for call in chunks.calls(num_workers):
         sizes.append(call.num)
-        owners, rows = call.owners[call.owner[: call.num]], call.rows[: call.num]
-        assert call.owners.shape == (MAX_OWNERS, 2)
-        assert call.owner.shape == (max_chunks(),)
-        assert len(call.rows) == max_chunks()
-        assert np.all(index[rows] == owners[:, :1])
-        assert np.all(structure[rows] == owners[:, 1:])
+        rows = call.rows[: call.num]
+        owner = call.owner[: call.num]
+        owner = owner if is_mixed else np.repeat(owner[:, None], rows.shape[1], axis=1)
+        assert call.owners.shape == (most_owners, 2)
+        assert len(call.owner) == len(call.rows) == max_chunks()
+        assert np.all(index[rows] == call.owners[owner][..., 0])
+        assert np.all(structure[rows] == call.owners[owner][..., 1])
+        # What a chunk is given of its object is read off its first place.
+        assert np.all(index[rows] == index[rows[:, :1]])
         found.append(value[rows])
     if num_points:
         np.testing.assert_array_equal(chunks.in_order(found), value)
-        most = -(-len(chunks.owner) // num_workers)
+        most = -(-chunks.num_chunks // num_workers)
         assert max(int(n) for n in sizes) <= max(most, 1)
     else:
         assert not found
+    # No more chunks than each object needs by itself.
+    counts = np.unique(index, return_counts=True)[1]
+    if is_mixed:
+        assert chunks.num_chunks == np.sum(-(-counts // CHUNK_SIZE))
 
 
 @pytest.mark.parametrize("backend", ["cpu", "gpu"])
