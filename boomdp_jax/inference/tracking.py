@@ -23,7 +23,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import FloatScalar, IntScalar, on_device
-from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.inference.contact_prediction import (
     ContactScene,
     contact_step,
@@ -339,13 +338,12 @@ def _dot(row, vector: list):
     return sum(terms[1:], terms[0])
 
 
-@full_precision
 def _apply(matrix, vector: Float[Array, "body 6"], *, is_lower: bool = False):
     """Matrix times channels, written out where there are few."""
     flat = vector.reshape(-1)
     num = flat.shape[0]
     if num > _MAX_WRITTEN_OUT:
-        # Not as a product of matrices, which in a batch of those are taken one by one.
+        # Not as a product of matrices: a batch of those is worked at one by one.
         return jnp.sum(matrix * flat[None], axis=1).reshape(vector.shape)
     rows = []
     for i in range(num):
