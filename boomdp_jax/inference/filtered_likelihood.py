@@ -20,7 +20,8 @@ from boomdp_jax.inference.one_step import NoiseStatistics, log_marginal
 from boomdp_jax.inference.track_data import TrackData
 from boomdp_jax.inference.tracking import Gains, innovations
 
-_CHANNEL_GROUPS = ((0, 1), (2,), (3, 4), (5,))
+CHANNEL_GROUPS = ((0, 1), (2,), (3, 4), (5,))
+"""Channels that share their noise: position, angle, velocity, spin."""
 
 
 class Innovations(NamedTuple):
@@ -148,5 +149,5 @@ def group_sums(values: Float[Array, "time 2 body 6"]) -> Float[Array, "body 4"]:
     """Sum over readings and over the channels of each group."""
     total = jnp.sum(values, axis=(0, 1))
     return jnp.stack(
-        [sum(total[:, c] for c in group) for group in _CHANNEL_GROUPS], axis=-1
+        [sum(total[:, c] for c in group) for group in CHANNEL_GROUPS], axis=-1
     )

@@ -7,6 +7,7 @@ import numpy as np
 
 from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.inference.fit import Fits, FitSettings, Host, best_of_each, make_fits
+from boomdp_jax.inference.fit_groups import FitGroups
 from boomdp_jax.inference.seeds import random_starts, seed_coordinates
 from boomdp_jax.inference.target import StructureTarget
 
@@ -87,10 +88,10 @@ def grown_fits(
             is_new = host.in_use[k] & ~host.in_use[chosen]
             draws[i, k] = np.where(is_new, block, z[i, chosen])
             draws[i, k, 0] = z[i, k]
-    value = best.value.reshape(num_objects, num_structures)
-    is_worth = np.ones(value.shape, bool)
+    is_worth = np.ones((num_objects, num_structures), bool)
     if lack is not None:
-        is_worth = value >= value.max(axis=1, keepdims=True) - lack[:, None]
+        groups = FitGroups(best.index, best.structure, num_objects, num_structures)
+        is_worth = groups.is_worth(best.value, lack).reshape(is_worth.shape)
     has_start = is_worth | np.stack([is_worth[:, p].any(axis=1) for p in parents], 1)
     return _best_draws(targets, draws, has_start, settings.num_starts)
 

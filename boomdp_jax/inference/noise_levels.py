@@ -36,7 +36,7 @@ from boomdp_jax.inference.fit_noise import NoiseDensity
 from boomdp_jax.inference.kalman import Filtered
 from boomdp_jax.inference.laplace_mixture import LaplaceMixture, make_mixture
 from boomdp_jax.inference.noise_level import NoiseFit
-from boomdp_jax.inference.noise_volume import OpenVolumes, open_volumes
+from boomdp_jax.inference.noise_volume import OpenVolumes, log_volume, open_volumes
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.typical_noise import TypicalNoise
 
@@ -355,10 +355,7 @@ def _volume(
     rows = np.arange(rowed.structures.shape[1])
     none, z = 0 * rows, np.tile(champion, (len(rows), 1))
     fits = Fits(none, rows, z, 0.0 * none, np.tile(precision, (len(rows), 1, 1)))
-    gradient, matrix = normal_equations(rowed, Host.of(rowed), fits)
-    step = np.linalg.solve(matrix, gradient[..., None])[..., 0]
-    gain = 0.5 * np.sum(step * gradient, axis=1)
-    return np.nan_to_num(gain - 0.5 * np.linalg.slogdet(matrix)[1])
+    return np.nan_to_num(log_volume(*normal_equations(rowed, Host.of(rowed), fits)))
 
 
 def _log_likelihood(rowed: StructureTarget, champion: np.ndarray) -> np.ndarray:

@@ -21,16 +21,17 @@ from jaxtyping import Array, Float
 from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.inference.evaluate import single_steps
+from boomdp_jax.inference.filtered_likelihood import CHANNEL_GROUPS
 from boomdp_jax.inference.fit import Host, with_prior
 from boomdp_jax.inference.kalman import Filtered, channel_scale, kick_scale, start_scale
 from boomdp_jax.inference.noise_level import NoiseFit
 from boomdp_jax.inference.one_step import NOISE_SHAPE
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.track_data import TrackData, TrackRow
+from boomdp_jax.inference.tracking import channel_difference
 from boomdp_jax.inference.used_rows import scan_used
 
-_NUM_CHANNELS, _NUM_GROUPS = 6, 4
-_GROUP = (0, 0, 1, 2, 2, 3)
+_NUM_CHANNELS = 6
 # Steps of the differences by coordinates, in posterior standard deviations, and their
 # limits in prior ones: one step shows far less of a coordinate than all rows do.
 _DIFFERENCE, _LEAST, _MOST = 0.2, 1e-2, 3e-2
@@ -76,13 +77,13 @@ def open_volumes(
         track: a noise and the filter of the champion with it, leading axis of one.
         noise: those of which it is asked.
     """
-    rows = _linearised(targets, structure, champion, precision, track)
+    likelihood: Any = targets.log_likelihood
+    data = jax.tree.map(lambda leaf: leaf[0], likelihood.data)
+    rows = _linearised(targets, data, structure, champion, precision, track)
     level = jax.tree.map(
         lambda leaf: jnp.asarray(leaf, targets.log_prior.dtype),
         (noise.reading, noise.impulse),
     )
-    likelihood: Any = targets.log_likelihood
-    data = jax.tree.map(lambda leaf: leaf[0], likelihood.data)
     sums, num = (np.asarray(x, float) for x in _sums(rows, data, *level))
     square = sums[:, :, -1, -1]
     host = Host.of(targets)
@@ -96,25 +97,35 @@ def open_volumes(
     each = np.full(len(total), structure)
     z = np.tile(champion, (len(total), 1))
     gradient, matrix = with_prior(host, each, z, total[:, :-1, -1], total[:, :-1, :-1])
-    step = np.linalg.solve(matrix, gradient[..., None])[..., 0]
-    gain = 0.5 * np.sum(step * gradient, axis=1)
-    log_volume = gain - 0.5 * np.linalg.slogdet(matrix)[1]
     return OpenVolumes(
-        np.where(is_finite, log_volume, -1e30),
+        np.where(is_finite, log_volume(gradient, matrix), -1e30),
         np.diagonal(np.linalg.inv(matrix), axis1=1, axis2=2),
     )
 
 
+def log_volume(gradient: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """By how much Laplace evidence exceeds the density where it was expanded.
+
+    But for a constant.
+
+    Args:
+        gradient: of minus the log-density there, `[point, dim]`.
+        matrix: its second derivatives, `[point, dim, dim]`.
+    """
+    step = np.linalg.solve(matrix, gradient[..., None])[..., 0]
+    gain = 0.5 * np.sum(step * gradient, axis=1)
+    return gain - 0.5 * np.linalg.slogdet(matrix)[1]
+
+
 def _linearised(
     targets: StructureTarget,
+    data: TrackData,
     structure: int,
     champion: np.ndarray,
     precision: np.ndarray,
     track: tuple[NoiseFit, Filtered],
 ) -> _Row:
     """The steps along a track, and their derivatives by differences."""
-    likelihood: Any = targets.log_likelihood
-    data = jax.tree.map(lambda leaf: np.asarray(leaf)[0], likelihood.data)
     noise, filtered = track
     state = _before_steps(data, filtered)
     scale = np.asarray(channel_scale(noise.reading[0]), float).reshape(-1)
@@ -142,24 +153,17 @@ def _linearised(
         change=put(here),
         slope=put(np.moveaxis(by_state, 0, -1) + np.eye(_NUM_CHANNELS)),
         rise=put(np.moveaxis(by_coordinate, 0, -1)),
-        read=jax.tree.map(lambda leaf: leaf[0], likelihood.data).rows,
+        read=data.rows,
     )
 
 
 def _before_steps(data: TrackData, filtered: Filtered) -> np.ndarray:
     """Means after the first reading of each row, `[time, 6]`."""
-    start = np.asarray(filtered.starts, float)[0, :, 0]
-    gain = np.asarray(filtered.gains.first, float)[0]
-    miss = np.asarray(data.first_mask * (data.steps.state))[:, 0]
-    miss = _least_angle(np.nan_to_num(miss) - start, np)
-    return start + np.einsum("tij,tj->ti", gain, data.first_mask[:, 0] * miss)
-
-
-def _least_angle(difference, numpy=jnp):
-    """Differences between states, angles the shorter way round."""
-    turns = numpy.round(difference / (2.0 * np.pi))
-    is_angle = np.arange(_NUM_CHANNELS) == 2
-    return difference - numpy.where(is_angle, 2.0 * np.pi * turns, 0.0)
+    start = jnp.asarray(filtered.starts[0, :, 0])
+    miss = np.asarray(channel_difference(data.steps.state[:, 0], start))
+    seen = np.where(np.asarray(data.first_mask)[:, 0] > 0, miss, 0.0)
+    gain = np.asarray(filtered.gains.first[0], float)
+    return np.asarray(start) + np.einsum("tij,tj->ti", gain, seen)
 
 
 @QuickCompile
@@ -200,14 +204,14 @@ def _sums(rows: _Row, data: TrackData, reading, impulse):
         read = row.read
         begins = read.is_start > 0
         first_mask, last_mask = read.first_mask[0], read.last_mask[0]
-        moved = _least_angle(at - row.state)
+        moved = _difference(at, row.state)
         mean = mean + moved[:, None, None] * is_last[None]
-        start = _least_angle(read.start[0] - row.state)
+        start = _difference(read.start[0], row.state)
         start = start[:, None, None] * is_last[None]
         mean = jnp.where(begins, start, mean)
         first = jnp.where(first_mask[:, None] > 0, variance, unknown[:, None])
         covariance = jnp.where(begins, unit * first[:, None], covariance)
-        miss = _least_angle(read.first[0] - row.state)
+        miss = _difference(read.first[0], row.state)
         (mean, covariance), one = correct(
             mean, covariance, miss, read.is_second * first_mask
         )
@@ -218,24 +222,28 @@ def _sums(rows: _Row, data: TrackData, reading, impulse):
         half = jnp.swapaxes(half, 0, 1)
         covariance = jnp.einsum("jk,kim->jim", row.slope, half)
         after = row.state + row.change
-        miss = _least_angle(read.last[0] - after)
+        miss = _difference(read.last[0], after)
         (mean, covariance), two = correct(mean, covariance, miss, last_mask)
         weight = 1.0 if read.weight is None else read.weight
         counts = weight * (read.is_second * first_mask + last_mask)
         new = []
-        for group in range(_NUM_GROUPS):
-            members = [c for c in range(_NUM_CHANNELS) if _GROUP[c] == group]
-            parts = [u[c][:, None] * u[c][None] for u in (one, two) for c in members]
+        for group in CHANNEL_GROUPS:
+            parts = [u[c][:, None] * u[c][None] for u in (one, two) for c in group]
             new.append(weight * sum(parts[1:], parts[0]))
-        here = jnp.stack([counts[np.equal(_GROUP, g)].sum() for g in range(4)])
+        here = jnp.stack([sum(counts[c] for c in group) for group in CHANNEL_GROUPS])
         return (mean, covariance, after, sums + jnp.stack(new), num + here), None
 
     carry = (
         jnp.zeros((_NUM_CHANNELS, size, num_noises), variance.dtype),
         unit * jnp.ones_like(variance)[:, None],
         jnp.zeros_like(rows.state[0]),
-        jnp.zeros((_NUM_GROUPS, size, size, num_noises), variance.dtype),
-        jnp.zeros(_NUM_GROUPS, variance.dtype),
+        jnp.zeros((len(CHANNEL_GROUPS), size, size, num_noises), variance.dtype),
+        jnp.zeros(len(CHANNEL_GROUPS), variance.dtype),
     )
     carry, _ = scan_used(advance, carry, rows, data.is_used)
     return jnp.moveaxis(carry[3], -1, 0), carry[4]
+
+
+def _difference(reading, state):
+    """Between two states of one body, angles the shorter way round."""
+    return channel_difference(reading[None], state[None])[0]
