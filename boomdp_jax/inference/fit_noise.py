@@ -1,5 +1,6 @@
 """Noise of readings and motion at a hypothesis, and the gains that follow from it."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -33,46 +34,68 @@ class NoisePeaks(NamedTuple):
     """Of readings and noise, `[point]`."""
 
 
+Density = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Of the noise at some of a list of hypotheses: from their places in the list and
+logarithms `[point, try, number]` to log-densities `[point, try]`."""
+
+
 def fit_noise(
     targets: StructureTarget, fits: Fits, start: NoiseFit, num_iterations: int = 12
 ) -> NoisePeaks:
     """Maximise likelihood times prior over the noise at hypotheses that stay fixed.
+
+    Args:
+        targets: with a `FilteredLikelihood`, stacked along a leading object axis.
+        fits: the hypotheses.
+        start: where to start; better too high than too low.
+        num_iterations: as `climb_noise` has it.
+
+    Returns:
+        The noise of each.
+    """
+    rows = np.arange(len(fits.z))
+    return climb_noise(NoiseDensity(targets, fits), rows, start, num_iterations)
+
+
+def climb_noise(
+    density: Density, rows: np.ndarray, start: NoiseFit, num_iterations: int = 12
+) -> NoisePeaks:
+    """Maximise a density of noise.
 
     Newton's method on the logarithms by differences; directions in which the density
     curves upwards are followed as if it curved downwards as much, and three lengths of
     every step are tried.
 
     Args:
-        targets: with a `FilteredLikelihood`, stacked along a leading object axis.
-        fits: the hypotheses.
-        start: where to start; better too high than too low.
+        density: what is maximised.
+        rows: of which hypothesis of its list, `[point]`.
+        start: of each point.
         num_iterations: most iterations; with 0 the curvature at the start is found.
 
     Returns:
-        The noise of each.
+        The noise of each point.
     """
-    density = NoiseDensity(targets, fits)
     x = start.vector.copy()
     value = np.full(len(x), -np.inf)
     precision = np.zeros((*x.shape, x.shape[1]))
-    rows = np.arange(len(x))
+    left = np.arange(len(x))
     for iteration in range(num_iterations + 1):
-        here, slope, matrix = density.derivatives(rows, x[rows])
-        value[rows], precision[rows] = here, matrix
+        here, slope, matrix = _derivatives(density, rows[left], x[left])
+        value[left], precision[left] = here, matrix
         if iteration == num_iterations:
             break
         step = np.linalg.solve(matrix, slope[..., None])[..., 0]
         longest = np.abs(step).max(axis=1, keepdims=True)
         step = step * np.minimum(1.0, _LONGEST_STEP / np.maximum(longest, 1e-12))
-        tries = x[rows][:, None] + _LENGTHS[None, :, None] * step[:, None]
-        found = density(rows, tries)
+        tries = x[left][:, None] + _LENGTHS[None, :, None] * step[:, None]
+        found = density(rows[left], tries)
         choice = np.argmax(found, axis=1)
-        each = np.arange(len(rows))
+        each = np.arange(len(left))
         is_better = found[each, choice] > here
         gain = np.where(is_better, found[each, choice] - here, 0.0)
-        x[rows] = np.where(is_better[:, None], tries[each, choice], x[rows])
-        rows = rows[gain > _ARRIVED]
-        if not rows.size:
+        x[left] = np.where(is_better[:, None], tries[each, choice], x[left])
+        left = left[gain > _ARRIVED]
+        if not left.size:
             break
     return NoisePeaks(NoiseFit.of_vector(x), precision, value)
 
@@ -99,35 +122,36 @@ class NoiseDensity:
         found = found + log_noise_prior(self._scale[fits.index], vector)
         return found.reshape(x.shape[:2])
 
-    def derivatives(self, rows: np.ndarray, x: np.ndarray):
-        """Value, gradient and minus the Hessian, made positive.
 
-        Noises of different bodies are taken not to bend the density together, so that
-        the work grows with the number of bodies and not with its square.
-        """
-        size = x.shape[1]
-        first, second = np.triu_indices(size, 1)
-        is_same = first // NUM_EACH == second // NUM_EACH
-        first, second = first[is_same], second[is_same]
-        unit = _DIFFERENCE * np.eye(size)
-        shifts = np.concatenate(
-            [np.zeros((1, size)), unit, -unit, unit[first] + unit[second]]
-        )
-        value = self(rows, x[:, None] + shifts[None])
-        worst = np.where(np.isfinite(value), value, np.inf).min(axis=1, keepdims=True)
-        value = np.where(np.isfinite(value), value, worst)
-        here, up, down = value[:, 0], value[:, 1 : size + 1], value[:, size + 1 :]
-        down, both = down[:, :size], down[:, size:]
-        slope = (up - down) / (2.0 * _DIFFERENCE)
-        each = np.arange(size)
-        hessian = np.zeros((len(x), size, size))
-        hessian[:, each, each] = up - 2.0 * here[:, None] + down
-        hessian[:, first, second] = both - up[:, first] - up[:, second] + here[:, None]
-        hessian[:, second, first] = hessian[:, first, second]
-        length, way = np.linalg.eigh(-hessian / _DIFFERENCE**2)
-        length = np.maximum(np.abs(length), _LEAST_CURVATURE)
-        matrix = (way * length[:, None]) @ np.swapaxes(way, 1, 2)
-        return here, slope, matrix
+def _derivatives(density: Density, rows: np.ndarray, x: np.ndarray):
+    """Value, gradient and minus the Hessian, made positive.
+
+    Noises of different bodies are taken not to bend the density together, so that
+    the work grows with the number of bodies and not with its square.
+    """
+    size = x.shape[1]
+    first, second = np.triu_indices(size, 1)
+    is_same = first // NUM_EACH == second // NUM_EACH
+    first, second = first[is_same], second[is_same]
+    unit = _DIFFERENCE * np.eye(size)
+    shifts = np.concatenate(
+        [np.zeros((1, size)), unit, -unit, unit[first] + unit[second]]
+    )
+    value = density(rows, x[:, None] + shifts[None])
+    worst = np.where(np.isfinite(value), value, np.inf).min(axis=1, keepdims=True)
+    value = np.where(np.isfinite(value), value, worst)
+    here, up, down = value[:, 0], value[:, 1 : size + 1], value[:, size + 1 :]
+    down, both = down[:, :size], down[:, size:]
+    slope = (up - down) / (2.0 * _DIFFERENCE)
+    each = np.arange(size)
+    hessian = np.zeros((len(x), size, size))
+    hessian[:, each, each] = up - 2.0 * here[:, None] + down
+    hessian[:, first, second] = both - up[:, first] - up[:, second] + here[:, None]
+    hessian[:, second, first] = hessian[:, first, second]
+    length, way = np.linalg.eigh(-hessian / _DIFFERENCE**2)
+    length = np.maximum(np.abs(length), _LEAST_CURVATURE)
+    matrix = (way * length[:, None]) @ np.swapaxes(way, 1, 2)
+    return here, slope, matrix
 
 
 def with_gains(

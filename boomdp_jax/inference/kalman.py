@@ -64,6 +64,8 @@ class FilteredRow(NamedTuple):
     """Log-density of the row's readings given all before."""
     start: Float[Array, "body 6"]
     """Mean before the first reading of the row."""
+    slope: Float[Array, "channel channel"]
+    """Derivative of the row's step by the state before it."""
 
 
 class Filtered(NamedTuple):
@@ -75,6 +77,8 @@ class Filtered(NamedTuple):
     """Mean before the first reading of each row."""
     after: Estimate
     """After each row, leading axis `time`."""
+    slopes: Float[Array, "time channel channel"]
+    """Derivative of each row's step by the state before it."""
 
 
 def channel_scale(reading):
@@ -157,7 +161,8 @@ class RowFilter:
             Estimate(images[0], covariance), row.last, row.last_mask
         )
         gains = Gains(first_gain, last_gain, first_whitening, last_whitening)
-        return estimate, FilteredRow(gains, first_density + last_density, start)
+        density = first_density + last_density
+        return estimate, FilteredRow(gains, density, start, slope)
 
     @full_precision
     def _update(self, estimate: Estimate, reading, mask):
@@ -220,8 +225,9 @@ def extended_filter(
         estimate, found = row_filter(estimate, row)
         density = found.log_likelihood
         density = density if row.weight is None else row.weight * density
-        return (estimate, total + density), (found.gains, found.start, estimate)
+        kept = (found.gains, found.start, estimate, found.slope)
+        return (estimate, total + density), kept
 
     carry = (row_filter.start(), jnp.zeros(()))
-    (_, total), (gains, starts, after) = scan_used(advance, carry, data.rows, is_used)
-    return Filtered(gains, total, starts, after)
+    (_, total), (gains, *rest) = scan_used(advance, carry, data.rows, is_used)
+    return Filtered(gains, total, *rest)

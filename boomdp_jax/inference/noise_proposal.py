@@ -14,9 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from boomdp_jax.inference.fit import Fits
-from boomdp_jax.inference.fit_noise import NoiseDensity, NoisePeaks, fit_noise
+from boomdp_jax.inference.fit_noise import Density, NoisePeaks, climb_noise
 from boomdp_jax.inference.noise_level import NUM_EACH, NoiseFit
-from boomdp_jax.inference.target import StructureTarget
 
 # Students' t of so many degrees of freedom; widths in terms of the curvature at the
 # peak, and the share of each.
@@ -53,42 +52,31 @@ class NoiseProposal(NamedTuple):
     def fit(
         cls,
         rng: np.random.Generator,
-        targets: StructureTarget,
-        draws: Fits,
-        group: np.ndarray,
+        density: Density,
         start: NoiseFit,
         *,
         is_near: bool = False,
     ) -> "NoiseProposal":
-        """Fit the noise at the best draw of every group.
+        """Cover a density of the noise of every group.
 
         Args:
             rng: source of randomness.
-            targets: stacked along a leading object axis.
-            draws: with their log-densities.
-            group: of each draw.
+            density: of the noise of each group.
             start: of each group.
             is_near: whether the start is known to be near a peak, from which the
                 others are then looked for at once and not for long.
         """
         num_groups = len(start.reading)
-        order = np.lexsort((-draws.value, group))
-        best = draws.take(order[np.searchsorted(group[order], np.arange(num_groups))])
-        if is_near:
-            first, others = _few_peaks(targets, best, start)
-        else:
-            first = fit_noise(targets, best, start, _NUM_ITERATIONS)
-            starts = _other_starts(first.noise.vector)
-            rows = np.tile(np.arange(num_groups), len(starts))
-            others = fit_noise(
-                targets,
-                best.take(rows),
-                NoiseFit.of_vector(starts.reshape(len(rows), -1)),
-                _NUM_ITERATIONS,
-            )
-        proposal = peaks = cls.of_peaks(first, others)
-        density = NoiseDensity(targets, best)
         names = np.arange(num_groups)
+        if is_near:
+            first, others = _few_peaks(density, start)
+        else:
+            first = climb_noise(density, names, start, _NUM_ITERATIONS)
+            starts = _other_starts(first.noise.vector)
+            rows = np.tile(names, len(starts))
+            tries = NoiseFit.of_vector(starts.reshape(len(rows), -1))
+            others = climb_noise(density, rows, tries, _NUM_ITERATIONS)
+        proposal = peaks = cls.of_peaks(first, others)
         num = _FEW_DRAWS if is_near else _NUM_DRAWS
         for _ in range(_FEW_ROUNDS if is_near else _NUM_ROUNDS):
             each = np.repeat(names, num)
@@ -198,15 +186,25 @@ class NoiseProposal(NamedTuple):
         return np.logaddexp.reduce(each + self.log_share[group], axis=1)
 
 
-def _few_peaks(
-    targets: StructureTarget, best: Fits, start: NoiseFit
-) -> tuple[NoisePeaks, NoisePeaks]:
+def best_of_groups(draws: Fits, group: np.ndarray) -> Fits:
+    """The draw of the largest log-density of every group.
+
+    Args:
+        draws: with their log-densities.
+        group: of each draw; every number from zero has some.
+    """
+    order = np.lexsort((-draws.value, group))
+    names = np.arange(group.max() + 1)
+    return draws.take(order[np.searchsorted(group[order], names)])
+
+
+def _few_peaks(density: Density, start: NoiseFit) -> tuple[NoisePeaks, NoisePeaks]:
     """Peaks from starts and from the others about them, all at the same time."""
     num = len(start.reading)
     vector = np.concatenate([start.vector[None], _other_starts(start.vector)])
     rows = np.tile(np.arange(num), len(vector))
     starts = NoiseFit.of_vector(vector.reshape(len(rows), -1))
-    found = fit_noise(targets, best.take(rows), starts, _FEW_ITERATIONS)
+    found = climb_noise(density, rows, starts, _FEW_ITERATIONS)
 
     def part(rows: slice) -> NoisePeaks:
         noise = NoiseFit(*(leaf[rows] for leaf in found.noise))

@@ -19,8 +19,9 @@ from boomdp_jax.inference.find_modes import (
     find_modes,
     find_modes_of_exact_starts,
 )
-from boomdp_jax.inference.fit import Modes
+from boomdp_jax.inference.fit import Host, Modes
 from boomdp_jax.inference.laplace_draws import best_hypothesis, sample_laplace
+from boomdp_jax.inference.linear_track import LinearTracks
 from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.noise_correction import infer_noise, noise_about_peaks
 from boomdp_jax.inference.noise_level import NoiseFit
@@ -315,6 +316,12 @@ def _rehearse(
         else settings,
         lambda targets, structure, z: -0.5 * (z**2).sum(axis=-1),
     )
+    if with_filters:
+        # One of the sizes that tracks have; each is a program, if a small one. The
+        # likelihood, which they need, is compiled by now.
+        middle = np.argsort(Host.of(targets).in_use.sum(axis=1))[[num_structures // 2]]
+        known = targets, first, middle, np.zeros((1, dim)), np.eye(dim)[None]
+        LinearTracks.along(*known, noise)(first, noise)
 
 
 def _is_mixed(targets: StructureTarget, draws: ChainDraws) -> bool:

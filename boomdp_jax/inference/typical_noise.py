@@ -19,7 +19,7 @@ from boomdp_jax.inference.fit import (
     collect_modes,
     make_fits,
 )
-from boomdp_jax.inference.fit_noise import with_gains
+from boomdp_jax.inference.fit_noise import NoiseDensity, with_gains
 from boomdp_jax.inference.noise_level import NoiseFit
 from boomdp_jax.inference.noise_proposal import NoiseProposal
 
@@ -75,9 +75,7 @@ def typical_noise(
     structure = top.structure[chosen]
     proposal = NoiseProposal.fit(
         rng,
-        targets,
-        top.take(chosen),
-        np.arange(len(chosen)),
+        NoiseDensity(targets, top.take(chosen)),
         found.noise.take(structure),
         is_near=is_near,
     )

@@ -1,0 +1,247 @@
+r"""Draws on their way from fixed gains to noise of their own: densities and moves.
+
+A draw is a structure, coordinates z as the fixed gains have them, and noise $\eta$;
+what it stands for is the hypothesis $T_\eta(z)$ (`noise_transport`). A structure whose
+map makes the weights of a few draws more uneven instead, as with several modes far from
+each other, does without.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from boomdp_jax.inference.draw_moves import Proposed, about_means, by_differences
+from boomdp_jax.inference.evaluate import evaluate_points, log_prior_density
+from boomdp_jax.inference.filter_points import filter_densities
+from boomdp_jax.inference.fit import Fits, Host
+from boomdp_jax.inference.fit_noise import NoiseDensity
+from boomdp_jax.inference.noise_level import NoiseFit, log_noise_prior
+from boomdp_jax.inference.noise_proposal import NoiseProposal, best_of_groups
+from boomdp_jax.inference.noise_transport import NoiseTransport
+from boomdp_jax.inference.target import StructureTarget
+from boomdp_jax.inference.tempered_smc import times
+
+KINDS = ("mean", "difference")
+"""Kinds of moves, to be made in turn."""
+
+# Length of steps by differences.
+_STEP_SIZE = 0.4
+# Draws of each group with which maps are tried.
+_NUM_TRIED = 64
+
+
+class NoiseDraws(NamedTuple):
+    """A flat list, chain after chain, object after object."""
+
+    structure: np.ndarray
+    z: np.ndarray
+    """Coordinates as the fixed gains have them, `[draw, dim]`."""
+    moved: np.ndarray
+    """Coordinates of the hypothesis, `[draw, dim]`."""
+    vector: np.ndarray
+    """Logarithms of the noise, `[draw, number]`."""
+    group: np.ndarray
+    log_first: np.ndarray
+    log_last: np.ndarray
+    """Of structure, coordinates, noise and readings, times `exp(log_volume)`."""
+    log_volume: np.ndarray
+    """Of what a unit of volume in z becomes."""
+    root: np.ndarray
+    """Which draw it comes from."""
+
+    @property
+    def ratio(self) -> np.ndarray:
+        """By how much the last density exceeds the first; of logarithms."""
+        ratio = self.log_last - self.log_first
+        return np.where(np.isfinite(ratio), ratio, -np.inf)
+
+    def take(self, rows: np.ndarray) -> "NoiseDraws":
+        """Some of them."""
+        return NoiseDraws(*(part[rows] for part in self))
+
+    def where(self, condition: np.ndarray, other: "NoiseDraws") -> "NoiseDraws":
+        """Those of this list where a condition holds, else of another."""
+        return NoiseDraws(
+            *(
+                np.where(condition.reshape(-1, *(1 for _ in a.shape[1:])), a, b)
+                for a, b in zip(self, other, strict=True)
+            )
+        )
+
+
+class NoiseProblem:
+    """Densities and moves of a list of draws."""
+
+    def __init__(
+        self,
+        targets: StructureTarget,
+        index: np.ndarray,
+        proposal: NoiseProposal,
+        transport: NoiseTransport | None,
+        is_moved: np.ndarray,
+    ):
+        """Keep what is known of the groups.
+
+        Args:
+            targets: stacked along a leading object axis.
+            index: object of each draw.
+            proposal: of the noise of each group.
+            transport: of each group; None: no group has any.
+            is_moved: whether a group makes use of it.
+        """
+        likelihood: Any = targets.log_likelihood
+        self._targets, self._index = targets, index
+        scale = np.asarray(likelihood.coordinates.scales.noise, float)
+        self._scale = scale[index]
+        self._host = Host.of(targets)
+        self._proposal, self._transport = proposal, transport
+        self._is_moved = is_moved
+
+    @classmethod
+    def start(
+        cls,
+        rng: np.random.Generator,
+        targets: StructureTarget,
+        index: np.ndarray,
+        draws: Fits,
+        start: NoiseFit,
+    ) -> tuple["NoiseProblem", NoiseDraws]:
+        """Fit maps and proposals, and give every draw its noise.
+
+        Args:
+            rng: source of randomness.
+            targets: stacked along a leading object axis.
+            index: object of each draw.
+            draws: under fixed gains, with their log-densities.
+            start: noise of every structure of every object, with which the gains were
+                made, in order.
+        """
+        name = draws.index * targets.structures.shape[1] + draws.structure
+        names, group = np.unique(name, return_inverse=True)
+        begin = start.take(names)
+        likelihood: Any = targets.log_likelihood
+        none = np.zeros(len(names), bool)
+        if likelihood.data.freedom is None:
+            transport = NoiseTransport(rng, targets, draws, group, begin)
+            proposal = transport.proposal
+        else:
+            # Linearised tracks know of normal noise only.
+            transport = None
+            density = NoiseDensity(targets, best_of_groups(draws, group))
+            proposal = NoiseProposal.fit(rng, density, begin)
+        vector = proposal.sample(rng, group)
+        is_moved = none
+        if transport is not None:
+            rows = _some_of_each(rng, group)
+            shares = [
+                cls(targets, index, proposal, transport, none + which)
+                ._given(draws, vector, group, rows)
+                .ratio
+                for which in (False, True)
+            ]
+            plain, moved = (_sizes(each, group[rows]) for each in shares)
+            is_moved = moved >= plain
+        problem = cls(targets, index, proposal, transport, is_moved)
+        return problem, problem._given(draws, vector, group, np.arange(len(group)))
+
+    def only(self, rows: np.ndarray) -> "NoiseProblem":
+        """The same for some of the draws."""
+        return NoiseProblem(
+            self._targets,
+            self._index[rows],
+            self._proposal,
+            self._transport,
+            self._is_moved,
+        )
+
+    def move(
+        self, rng: np.random.Generator, draws: NoiseDraws, power: np.ndarray, kind: str
+    ) -> NoiseDraws:
+        """One Metropolis step of every draw, along the spread of its group.
+
+        Args:
+            rng: source of randomness.
+            draws: the list.
+            power: how far from the first density to the last, of each object.
+            kind: one of `KINDS`.
+        """
+        power = power[self._index]
+        proposed = self._propose(rng, draws, kind)
+        dim = draws.z.shape[1]
+        z, vector = proposed.values[:, :dim], proposed.values[:, dim:]
+        trial = self._with_last(draws._replace(z=z, vector=vector))
+        first = np.zeros_like(trial.log_last)
+        if np.any(power < 1.0):
+            found = evaluate_points(self._targets, self._index, draws.structure, z)
+            first = found.log_density
+            first = first + self._proposal.log_density(vector, draws.group)
+        trial = trial._replace(log_first=first)
+        gain = _tempered(trial, power) - _tempered(draws, power) + proposed.log_ratio
+        is_accepted = np.log(rng.random(len(gain))) < gain
+        return trial.where(is_accepted, draws)
+
+    def _given(
+        self, draws: Fits, vector: np.ndarray, group: np.ndarray, rows: np.ndarray
+    ) -> NoiseDraws:
+        """Some draws with noise given them."""
+        vector, group, draws = vector[rows], group[rows], draws.take(rows)
+        none = np.zeros(len(rows))
+        first = draws.value + self._proposal.log_density(vector, group)
+        z = draws.z.astype(float)
+        fresh = NoiseDraws(
+            draws.structure, z, z, vector, group, first, none, none, rows
+        )
+        return self.only(rows)._with_last(fresh)
+
+    def _with_last(self, draws: NoiseDraws) -> NoiseDraws:
+        """With what follows from structure, coordinates and noise."""
+        z, log_volume = draws.z, np.zeros(len(draws.z))
+        rows = np.flatnonzero(self._is_moved[draws.group])
+        if self._transport is not None and rows.size:
+            z = z.copy()
+            z[rows], log_volume[rows] = self._transport.move(
+                draws.group[rows], draws.z[rows], draws.vector[rows]
+            )
+        noise = NoiseFit.of_vector(draws.vector)
+        known = self._targets, self._index, draws.structure, z
+        value = filter_densities(*known, noise) + log_prior_density(*known)
+        value = value + log_noise_prior(self._scale, draws.vector) + log_volume
+        return draws._replace(moved=z, log_last=value, log_volume=log_volume)
+
+    def _propose(self, rng, draws: NoiseDraws, kind: str) -> Proposed:
+        values = np.concatenate([draws.z, draws.vector], axis=1)
+        num_noise = draws.vector.shape[1]
+        period = np.concatenate([self._host.period, np.zeros(num_noise)])
+        if kind == "mean":
+            return about_means(rng, values, draws.group, period)
+        num_moved = self._host.in_use.sum(axis=1)[draws.structure] + num_noise
+        return by_differences(rng, values, draws.group, period, num_moved, _STEP_SIZE)
+
+
+def effective_size(log_weight: np.ndarray) -> float:
+    """Draws that weights count for."""
+    top = log_weight.max()
+    if not np.isfinite(top):
+        return 0.0
+    weight = np.exp(log_weight - top)
+    return float(weight.sum() ** 2 / (weight**2).sum())
+
+
+def _sizes(log_weight: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Effective sizes of groups, `[group]`; every number from zero has some draws."""
+    names = range(group.max() + 1)
+    return np.array([effective_size(log_weight[group == name]) for name in names])
+
+
+def _some_of_each(rng: np.random.Generator, group: np.ndarray) -> np.ndarray:
+    """Rows of a few draws of every group, picked at random."""
+    mixed = rng.permutation(len(group))
+    order = mixed[np.argsort(group[mixed], kind="stable")]
+    begin = np.searchsorted(group[order], group[order])
+    return order[np.arange(len(order)) - begin < _NUM_TRIED]
+
+
+def _tempered(draws: NoiseDraws, power: np.ndarray) -> np.ndarray:
+    first = np.where(power < 1.0, (1.0 - power) * draws.log_first, 0.0)
+    value = first + times(power, draws.log_last)
+    return np.where(np.isnan(value), -np.inf, value)
