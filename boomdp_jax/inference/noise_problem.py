@@ -120,7 +120,6 @@ class NoiseProblem:
         names, group = np.unique(name, return_inverse=True)
         begin = start.take(names)
         likelihood: Any = targets.log_likelihood
-        none = np.zeros(len(names), bool)
         if likelihood.data.freedom is None:
             transport = NoiseTransport(rng, targets, draws, group, begin)
             proposal = transport.proposal
@@ -130,16 +129,15 @@ class NoiseProblem:
             density = NoiseDensity(targets, best_of_groups(draws, group))
             proposal = NoiseProposal.fit(rng, density, begin)
         vector = proposal.sample(rng, group)
-        is_moved = none
+        is_moved = np.zeros(len(names), bool)
         if transport is not None:
             rows = _some_of_each(rng, group)
-            shares = [
-                cls(targets, index, proposal, transport, none + which)
-                ._given(draws, vector, group, rows)
-                .ratio
-                for which in (False, True)
-            ]
-            plain, moved = (_sizes(each, group[rows]) for each in shares)
+            sizes = []
+            for choice in (is_moved, ~is_moved):
+                tried = cls(targets, index, proposal, transport, choice)
+                found = tried._given(draws, vector, group, rows)
+                sizes.append(_sizes(found.ratio, group[rows]))
+            plain, moved = sizes
             is_moved = moved >= plain
         problem = cls(targets, index, proposal, transport, is_moved)
         return problem, problem._given(draws, vector, group, np.arange(len(group)))
