@@ -139,7 +139,8 @@ def _derivatives(density: Density, rows: np.ndarray, x: np.ndarray):
     )
     value = density(rows, x[:, None] + shifts[None])
     worst = np.where(np.isfinite(value), value, np.inf).min(axis=1, keepdims=True)
-    value = np.where(np.isfinite(value), value, worst)
+    is_known = np.isfinite(worst)
+    value = np.where(np.isfinite(value), value, np.where(is_known, worst, 0.0))
     here, up, down = value[:, 0], value[:, 1 : size + 1], value[:, size + 1 :]
     down, both = down[:, :size], down[:, size:]
     slope = (up - down) / (2.0 * _DIFFERENCE)
@@ -151,7 +152,7 @@ def _derivatives(density: Density, rows: np.ndarray, x: np.ndarray):
     length, way = np.linalg.eigh(-hessian / _DIFFERENCE**2)
     length = np.maximum(np.abs(length), _LEAST_CURVATURE)
     matrix = (way * length[:, None]) @ np.swapaxes(way, 1, 2)
-    return here, slope, matrix
+    return np.where(is_known[:, 0], here, -np.inf), slope, matrix
 
 
 def with_gains(

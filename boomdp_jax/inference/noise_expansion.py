@@ -155,9 +155,9 @@ class NoiseExpansion:
         index = self._fits.index[group]
         z, value, gradient, matrix = expanded
         mean, factor = self.tight(group, z, gradient, matrix)
-        _, size, inverse, length = _newton(matrix, gradient)
+        _, size, unit, length = _newton(matrix, gradient)
         value = value + 0.5 * size**2 - np.log(length).sum(axis=1)
-        value = value + 0.5 * np.linalg.slogdet(inverse)[1]
+        value = value - 0.5 * np.linalg.slogdet(unit)[1]
         return Laplace(
             mean, factor, value + log_noise_prior(self._scale[index], vector)
         )
@@ -259,8 +259,8 @@ class NoiseExpansion:
         small = grown[here[..., None], place[:, :, None], place[:, None, :]]
         small = np.where(both, small, np.eye(place.shape[1])[None])
         slope = np.pad(gradient, ((0, 0), (0, 1)))[here, place]
-        step, _, inverse, length = _newton(small, np.where(is_tight, slope, 0.0))
-        factor = np.linalg.cholesky(inverse) / length[:, :, None]
+        step, _, unit, length = _newton(small, np.where(is_tight, slope, 0.0))
+        factor = _inverse_factor(unit) / length[:, :, None]
         start = np.pad(z, ((0, 0), (0, 1)))[here, place]
         return np.where(is_tight, start - step, 0.0), factor
 
@@ -274,25 +274,36 @@ def _newton(matrix: np.ndarray, gradient: np.ndarray, most: float = _FARTHEST):
         most: longest step.
 
     Returns:
-        Steps and lengths, and the inverse of each matrix scaled to ones on the
-        diagonal, by the square roots of what was there.
+        Steps and lengths, and each matrix scaled to ones on the diagonal, made surely
+        positive, by the square roots of what was there.
     """
     length = np.sqrt(np.diagonal(matrix, axis1=1, axis2=2))
     unit = matrix / (length[:, :, None] * length[:, None, :])
-    inverse = _inverse(unit)
-    step = (inverse @ (gradient / length)[..., None])[..., 0] / length
+    unit = _positive(unit)
+    step = np.linalg.solve(unit, (gradient / length)[..., None])[..., 0] / length
     size = np.sqrt(np.maximum(np.sum(step * gradient, axis=1), 0.0))
     short = np.minimum(1.0, most / np.maximum(size, 1e-12))
-    return step * short[:, None], size * short, inverse, length
+    return step * short[:, None], size * short, unit, length
 
 
-def _inverse(unit: np.ndarray) -> np.ndarray:
-    """Of matrices with ones on the diagonal, positive definite but for rounding."""
+def _positive(unit: np.ndarray) -> np.ndarray:
+    """Matrices with ones on the diagonal, made positive definite despite rounding."""
     unit = unit + _RIDGE * np.eye(unit.shape[1])
     try:
         np.linalg.cholesky(unit)
     except np.linalg.LinAlgError:
         length, way = np.linalg.eigh(unit)
         length = np.maximum(length, _RIDGE)
-        return (way / length[:, None]) @ np.swapaxes(way, 1, 2)
-    return np.linalg.inv(unit)
+        return (way * length[:, None]) @ np.swapaxes(way, 1, 2)
+    return unit
+
+
+def _inverse_factor(matrix: np.ndarray) -> np.ndarray:
+    """Lower Cholesky factors of the inverses of matrices.
+
+    Of the matrix with rows and columns the other way round the factor is, the other way
+    round again, an upper one, whose inverse transposed is what is asked for. Inverses
+    have rounding errors and need not have a factor.
+    """
+    turned = np.linalg.cholesky(matrix[:, ::-1, ::-1])[:, ::-1, ::-1]
+    return np.swapaxes(np.linalg.inv(turned), 1, 2)

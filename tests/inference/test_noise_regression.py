@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from boomdp_jax.inference import noise_expansion
 from boomdp_jax.inference.draw_ridge import DrawRidge
 from boomdp_jax.inference.noise_regression import NoiseRegression
 
@@ -69,3 +70,26 @@ def test_a_ridge_over_an_angle_closes_after_a_turn():
     turned = z + np.array([np.pi, 0.0])
     np.testing.assert_allclose(ridge(turned), ridge(z), atol=1e-9)
     np.testing.assert_allclose(ridge(z)[:, 0], z[:, 1], atol=1e-6)
+
+
+def test_factors_of_inverses_despite_rounding():
+    rng = np.random.default_rng(5)
+    half = rng.normal(size=(20, 6, 6))
+    matrix = half @ np.swapaxes(half, 1, 2)
+    factor = noise_expansion._inverse_factor(matrix)
+    np.testing.assert_allclose(np.triu(factor, 1), 0.0)
+    product = factor @ np.swapaxes(factor, 1, 2)
+    np.testing.assert_allclose(
+        product @ matrix, np.tile(np.eye(6), (20, 1, 1)), atol=1e-6
+    )
+    # Of rank two but for what single precision leaves, which may be negative.
+    thin = rng.normal(size=(50, 9, 2))
+    matrix = thin @ np.swapaxes(thin, 1, 2)
+    length = np.sqrt(np.diagonal(matrix, axis1=1, axis2=2))
+    unit = matrix / (length[:, :, None] * length[:, None, :])
+    unit = unit.astype(np.float32).astype(float)
+    # A correlation above one is no rounding error, and does no harm either.
+    unit[0, 0, 1] = unit[0, 1, 0] = 1.5
+    factor = noise_expansion._inverse_factor(noise_expansion._positive(unit))
+    assert np.isfinite(factor).all()
+    assert np.all(np.diagonal(factor, axis1=1, axis2=2) > 0.0)
