@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from boomdp_jax.core.full_precision import full_precision
-from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.core.spread import Program, run_each
 from boomdp_jax.inference.chunking import CHUNK_SIZE
+from boomdp_jax.inference.draw_moves import wrapped
 from boomdp_jax.inference.evaluate import single_steps
 from boomdp_jax.inference.filter_points import filter_points
 from boomdp_jax.inference.filtered_likelihood import CHANNEL_GROUPS
@@ -39,6 +39,8 @@ _DIFFERENCE, _LEAST, _MOST = 0.2, 1e-2, 3e-2
 # them grows: few programs.
 _NUM_LANES, _MOST_TRACKS = 64, 8
 _ROOM = 8
+# Of the channels of a body.
+_PERIOD = np.array([0.0, 0.0, 2.0 * np.pi, 0.0, 0.0, 0.0])
 
 
 class NoiseSums(NamedTuple):
@@ -243,13 +245,10 @@ def _changes(
 def _before_steps(data: TrackData, index: np.ndarray, filtered: Filtered) -> np.ndarray:
     """Means after the first reading of each row, `[track, time, body, 6]`."""
     start = np.asarray(filtered.starts, float)
-    miss = np.asarray(_DIFFERENCES(data.steps.state[index], filtered.starts))
+    miss = wrapped(np.asarray(data.steps.state)[index] - start, _PERIOD)
     seen = np.where(data.first_mask[index] > 0, miss, 0.0).reshape(*start.shape[:2], -1)
     gain = np.asarray(filtered.gains.first, float)
     return start + np.einsum("ntij,ntj->nti", gain, seen).reshape(start.shape)
-
-
-_DIFFERENCES = QuickCompile(jax.vmap(jax.vmap(channel_difference)))
 
 
 @full_precision

@@ -30,7 +30,7 @@ from boomdp_jax.inference.noise_problem import (
     NoiseProblem,
     effective_size,
 )
-from boomdp_jax.inference.noise_proposal import NoiseProposal, best_of_groups
+from boomdp_jax.inference.noise_proposal import NoiseProposal, best_of_groups, groups_of
 from boomdp_jax.inference.resampling import systematic
 from boomdp_jax.inference.structure_evidence import StructureEvidence, reweighed
 from boomdp_jax.inference.target import StructureTarget
@@ -182,8 +182,7 @@ def noise_about_peaks(
     """
     index = np.repeat(np.arange(len(structure)), structure.shape[1])
     fits = _as_fits(index, structure, z, log_density)
-    name = index * targets.structures.shape[1] + fits.structure
-    names, group = np.unique(name, return_inverse=True)
+    names, group = groups_of(targets, fits)
     density = NoiseDensity(targets, best_of_groups(fits, group))
     proposal = NoiseProposal.fit(rng, density, start.take(names))
     if not is_drawn:

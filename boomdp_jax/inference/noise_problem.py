@@ -16,7 +16,7 @@ from boomdp_jax.inference.filter_points import filter_densities
 from boomdp_jax.inference.fit import Fits, Host
 from boomdp_jax.inference.fit_noise import NoiseDensity
 from boomdp_jax.inference.noise_level import NoiseFit, log_noise_prior
-from boomdp_jax.inference.noise_proposal import NoiseProposal, best_of_groups
+from boomdp_jax.inference.noise_proposal import NoiseProposal, best_of_groups, groups_of
 from boomdp_jax.inference.noise_transport import NoiseTransport
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.tempered_smc import times
@@ -116,8 +116,7 @@ class NoiseProblem:
             start: noise of every structure of every object, with which the gains were
                 made, in order.
         """
-        name = draws.index * targets.structures.shape[1] + draws.structure
-        names, group = np.unique(name, return_inverse=True)
+        names, group = groups_of(targets, draws)
         begin = start.take(names)
         likelihood: Any = targets.log_likelihood
         if likelihood.data.freedom is None:

@@ -16,6 +16,7 @@ import numpy as np
 from boomdp_jax.inference.fit import Fits
 from boomdp_jax.inference.fit_noise import Density, NoisePeaks, climb_noise
 from boomdp_jax.inference.noise_level import NUM_EACH, NoiseFit
+from boomdp_jax.inference.target import StructureTarget
 
 # Students' t of so many degrees of freedom; widths in terms of the curvature at the
 # peak, and the share of each.
@@ -184,6 +185,18 @@ class NoiseProposal(NamedTuple):
         constant -= 0.5 * size * math.log(_FREEDOM * math.pi)
         each = volume[group] + constant - half * np.log1p(square / _FREEDOM)
         return np.logaddexp.reduce(each + self.log_share[group], axis=1)
+
+
+def groups_of(targets: StructureTarget, draws: Fits) -> tuple[np.ndarray, np.ndarray]:
+    """Groups of draws that share object and structure.
+
+    Returns:
+        Place of each group among all structures of all objects, in order, and the group
+        of each draw.
+    """
+    name = draws.index * targets.structures.shape[1] + draws.structure
+    names, group = np.unique(name, return_inverse=True)
+    return names, group
 
 
 def best_of_groups(draws: Fits, group: np.ndarray) -> Fits:
