@@ -33,6 +33,10 @@ from boomdp_jax.physics.lone_friction import (
 from boomdp_jax.physics.motion import Motion
 from boomdp_jax.physics.trigonometry import heading_turn, rotated
 
+# Most of the turn from mid-step to the end that impulses know of [rad]. They act along
+# one frame and friction looks in the other: that gives up to one over the cosine of the
+# turn, and beyond a quarter of a revolution without end.
+_MOST_HALF_TURN = 0.5
 # Substeps that are written out in one loop; more are compiled as a loop of such loops.
 # With so many the reverse pass is one loop too (`core.scalar_parts`).
 _MOST_IN_A_LOOP = 2
@@ -238,7 +242,8 @@ def _sliding(
     h = body.length
     motion, start = turned
     vx, vy, spin = motion[3:]
-    half = rotated(None, 0.5 * h * spin)
+    angle = jnp.clip(0.5 * h * spin, -_MOST_HALF_TURN, _MOST_HALF_TURN)
+    half = rotated(None, angle)
     middle = out_of(start, *half)
     px, py = body.mass * vx + impulse[0], body.mass * vy + impulse[1]
     push_x, push_y = into(middle, px, py)

@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from tests.physics.scenes import convergence_orders, run
-from tests.reference.planar_dynamics import Wheel, World, energy, integrate
+from tests.reference.planar_dynamics import Pin, Wheel, World, energy, integrate
 
 BRICK = World([(0.3, 0.1)], [20.0])
 LEVEL = np.zeros((1, 3))
@@ -181,3 +181,21 @@ def test_coefficient_keeps_its_meaning_when_the_step_changes():
     coarse = run(world, LEVEL, twist, num_steps=50, dt=0.02)
     fine = run(world, LEVEL, twist, num_steps=200, dt=0.005)
     np.testing.assert_allclose(coarse.pose[-1], fine.pose[-1], atol=2e-3)
+
+
+@pytest.mark.parametrize("pins", [[], [Pin(0, (0.25, 0.05), (0.25, 0.05))]])
+@pytest.mark.parametrize("spin", [40.0, 63.0, 90.0, 200.0])
+def test_friction_takes_energy_from_a_body_however_fast_it_spins(pins, spin):
+    """At 20 Hz, several revolutions within a step included.
+
+    Between two frames that differ by half a radian a single step may give a little.
+    """
+    arm = np.array([-0.05, 0.25]) if pins else np.array([0.02, 0.01])
+    wheel = Wheel(0, (-0.2, 0.1), 0.4, (3.0, 200.0), (2.0, 2000.0))
+    world = with_wheel(wheel).with_(pins=pins)
+    twist = np.array([[*-spin * arm, spin]])
+    trajectory = run(world, LEVEL, twist, num_steps=50, dt=0.05, num_substeps=1)
+    energies = energy(world, trajectory.pose, trajectory.twist)
+    before = np.append(energy(world, LEVEL, twist), energies[:-1])
+    assert np.all(energies <= 1.05 * before), energies / before
+    assert energies[-1] < 0.5 * energy(world, LEVEL, twist)
