@@ -24,6 +24,7 @@ from boomdp_jax.inference.fit import (
     make_fits,
 )
 from boomdp_jax.inference.fit_noise import NoisePeaks, fit_noise, with_gains
+from boomdp_jax.inference.fit_search import search_further
 from boomdp_jax.inference.fit_starts import Guesses, first_fits, grown_fits
 from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.noise_level import NUM_EACH, NoiseFit
@@ -165,7 +166,7 @@ def _single_step_fits(
     num = np.asarray(likelihood.data.steps.mask).sum(axis=(1, 2, 3))
     lack = np.maximum(_LACK * num, _HOPELESS)
     fits = _climbed(rng, targets, guesses, starts, settings, lack, from_anywhere=True)
-    return fits, lack
+    return search_further(rng, targets, guesses, fits, settings, lack), lack
 
 
 def _climbed(

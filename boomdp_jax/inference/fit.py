@@ -49,6 +49,8 @@ class FitSettings(NamedTuple):
     """Most iterations of a later climb, from fits with other gains."""
     num_modes: int = 3
     """Distinct modes that are kept."""
+    num_searches: int = 3
+    """Most rounds of further climbs with single steps, where few climbs agree."""
 
 
 class Modes(NamedTuple):
@@ -173,6 +175,7 @@ def climb(
     lack: np.ndarray | None = None,
     *,
     from_anywhere: bool = False,
+    is_patient: bool = False,
 ) -> Fits:
     """Take points to their optima.
 
@@ -184,6 +187,7 @@ def climb(
             nats; those further below stay where they are. None: however much.
         from_anywhere: whether nothing has been climbed yet; structures then have a few
             iterations, and twice as much, before they are given up.
+        is_patient: whether fits go on however far they are below the best.
 
     Returns:
         The same list, uphill.
@@ -198,7 +202,8 @@ def climb(
         is_moving &= groups.is_worth(value, lack)
     for iteration in range(num_iterations):
         if iteration >= _PATIENCE:
-            is_moving &= value > groups.best(value) - _HOPELESS
+            if not is_patient:
+                is_moving &= value > groups.best(value) - _HOPELESS
             is_moving &= ~groups.is_repeated(value, z, precision, host.wrap)
             if lack is not None:
                 lenience = _LENIENCE if from_anywhere else 1.0
