@@ -3,11 +3,11 @@
 Slipping and holding, saturated limits and angles make many local optima, and the best
 few of many starts tend to lie in one basin. Of boxes with a wheel whose numbers are
 drawn from the prior, seen for twenty steps, the best of eight climbs from such starts
-misses the truth by more than five nats in one of seven, by hundreds in most of them.
-What gives a miss away is that few climbs end at the best: an optimum is taken for the
-highest once several have (Boender and Rinnooy Kan 1987, Mathematical Programming 37,
-59). Else climbs start from anywhere, without regard to how high that is, and from the
-best one with some coordinates changed (iterated local search, Lourenço et al. 2003).
+misses the truth by more than five nats in one of eight, by tens to hundreds. What gives
+a miss away is that few climbs end at the best: an optimum is taken for the highest once
+several have (Boender and Rinnooy Kan 1987, Mathematical Programming 37, 59). Else
+climbs start from anywhere, without regard to how high that is, and from the best one
+with some coordinates changed (iterated local search, Lourenço et al. 2003).
 """
 
 from typing import Any
