@@ -23,12 +23,12 @@ import jax.extend
 import jax.numpy as jnp
 from jax.interpreters import ad, batching, mlir
 
-# Lanes of a block on a CPU. Arrays of a round of pairs are then small enough that the
-# backend leaves each loop to one core: with twice as many it spreads every one of them
-# over all cores, and the waiting for each other costs more than the work (16 instead of
-# 8 us of CPU time for a step of ten boxes between four walls). With half as many, calls
-# of small loops cost a quarter.
-_BLOCK = 128
+BLOCK = 128
+"""Lanes of a block on a CPU, unless a caller knows better. Arrays of a round of pairs
+are then small enough that the backend leaves each loop to one core: with twice as many
+it spreads every one of them over all cores, and the waiting for each other costs more
+than the work (16 instead of 8 us of CPU time for a step of ten boxes between four
+walls). With half as many, calls of small loops cost a quarter."""
 
 _lanes_p = jax.extend.core.Primitive("in_lanes")
 _lanes_p.multiple_results = True
@@ -98,7 +98,10 @@ class _Transposed:
 
 
 def in_lanes(
-    function: Callable[..., Any], *arguments: Any, static: tuple[Hashable, ...] = ()
+    function: Callable[..., Any],
+    *arguments: Any,
+    static: tuple[Hashable, ...] = (),
+    block: int = BLOCK,
 ) -> Any:
     """Call a function whose arrays have a last axis over independent lanes.
 
@@ -108,6 +111,8 @@ def in_lanes(
             level, since what it is compiled to is remembered.
         arguments: trees of arrays without that axis.
         static: what the function takes before its arguments, hashable.
+        block: lanes that are worked on together on a CPU. Where the arrays of a lane
+            are small, more of them make calls of small loops count for less.
 
     Returns:
         What the function returns, without the last axis. Batched by `jax.vmap` along
@@ -117,7 +122,7 @@ def in_lanes(
     leaves = [jnp.asarray(leaf)[..., None] for leaf in leaves]
     program = _Program(function, static, treedef)
     tree_out, _ = _results(program, _shapes_of(leaves), _is_double())
-    out = _lanes_p.bind(*leaves, program=program)
+    out = _lanes_p.bind(*leaves, program=program, block=block)
     return jax.tree.unflatten(tree_out, [leaf[..., 0] for leaf in out])
 
 
@@ -142,17 +147,18 @@ def _results(program, shapes: tuple, is_double: bool) -> tuple:
 
 
 @_lanes_p.def_abstract_eval
-def _abstract(*avals, program):
+def _abstract(*avals, program, block):
+    del block
     _, out = _results(program, _shapes_of(avals), _is_double())
     lanes = avals[0].shape[-1]
     return [jax.core.ShapedArray((*shape, lanes), dtype) for shape, dtype in out]
 
 
 @functools.lru_cache(maxsize=256)
-def _compiled(program):
+def _compiled(program, block):
     def run(*arguments):
         if any(isinstance(a, jax.core.Tracer) for a in arguments):
-            return _lanes_p.bind(*arguments, program=program)
+            return _lanes_p.bind(*arguments, program=program, block=block)
         # Compilation is switched off.
         return program(*arguments)
 
@@ -160,11 +166,11 @@ def _compiled(program):
 
 
 @_lanes_p.def_impl
-def _run(*arguments, program):
-    return _compiled(program)(*arguments)
+def _run(*arguments, program, block):
+    return _compiled(program, block)(*arguments)
 
 
-def _batched(arguments: Sequence, dims: Sequence, *, program):
+def _batched(arguments: Sequence, dims: Sequence, *, program, block):
     size = next(
         a.shape[d] for a, d in zip(arguments, dims, strict=True) if d is not None
     )
@@ -181,7 +187,9 @@ def _batched(arguments: Sequence, dims: Sequence, *, program):
         return array.reshape(*array.shape[:-2], lanes * size)
 
     out = _lanes_p.bind(
-        *(merged(a, d) for a, d in zip(arguments, dims, strict=True)), program=program
+        *(merged(a, d) for a, d in zip(arguments, dims, strict=True)),
+        program=program,
+        block=block,
     )
     out = [leaf.reshape(*leaf.shape[:-1], lanes, size) for leaf in out]
     return out, [leaf.ndim - 1 for leaf in out]
@@ -190,14 +198,15 @@ def _batched(arguments: Sequence, dims: Sequence, *, program):
 batching.primitive_batchers[_lanes_p] = _batched
 
 
-def _jvp(primals, tangents, *, program):
-    out = _lanes_p.bind(*primals, program=program)
+def _jvp(primals, tangents, *, program, block):
+    out = _lanes_p.bind(*primals, program=program, block=block)
     active = tuple(i for i, t in enumerate(tangents) if type(t) is not ad.Zero)
     floating = tuple(
         i for i, o in enumerate(out) if jnp.issubdtype(o.dtype, jnp.inexact)
     )
     tangent = _Tangent(program, len(primals), active, floating)
-    moved = _lanes_p.bind(*primals, *(tangents[i] for i in active), program=tangent)
+    rates = (tangents[i] for i in active)
+    moved = _lanes_p.bind(*primals, *rates, program=tangent, block=block)
     rates = [ad.Zero(jax.typeof(o).to_tangent_aval()) for o in out]
     for i, rate in zip(floating, moved, strict=True):
         rates[i] = rate
@@ -207,7 +216,7 @@ def _jvp(primals, tangents, *, program):
 ad.primitive_jvps[_lanes_p] = _jvp
 
 
-def _transpose(cotangents, *arguments, program):
+def _transpose(cotangents, *arguments, program, block):
     primals = arguments[: program.num]
     present = tuple(i for i, ct in enumerate(cotangents) if type(ct) is not ad.Zero)
     if not present:
@@ -215,36 +224,38 @@ def _transpose(cotangents, *arguments, program):
             ad.Zero(a.aval) if ad.is_undefined_primal(a) else None for a in arguments
         ]
     given = [cotangents[i] for i in present]
-    out = _lanes_p.bind(*primals, *given, program=_Transposed(program, present))
+    transposed = _Transposed(program, present)
+    out = _lanes_p.bind(*primals, *given, program=transposed, block=block)
     return [None] * program.num + list(out)
 
 
 ad.primitive_transposes[_lanes_p] = _transpose
 
 
-def _in_blocks(*arguments, program):
+def _in_blocks(*arguments, program, block):
     """Block after block, each of the same length."""
     lanes = arguments[0].shape[-1]
-    num = -(-lanes // _BLOCK)
+    num = -(-lanes // block)
     if num == 1:
         return program(*arguments)
     length = -(-lanes // num)
     spare = num * length - lanes
 
-    def blocks(array):
+    def in_parts(array):
         if spare:
             rest = jnp.broadcast_to(array[..., -1:], (*array.shape[:-1], spare))
             array = jnp.concatenate([array, rest], axis=-1)
         return jnp.moveaxis(array.reshape(*array.shape[:-1], num, length), -2, 0)
 
-    out = jax.lax.map(lambda block: program(*block), [blocks(a) for a in arguments])
+    out = jax.lax.map(lambda part: program(*part), [in_parts(a) for a in arguments])
     merged = [jnp.moveaxis(leaf, 0, -2) for leaf in out]
     return [
         leaf.reshape(*leaf.shape[:-2], num * length)[..., :lanes] for leaf in merged
     ]
 
 
-def _at_once(*arguments, program):
+def _at_once(*arguments, program, block):
+    del block
     return program(*arguments)
 
 

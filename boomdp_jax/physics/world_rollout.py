@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from boomdp_jax.core.lanes import in_lanes
+from boomdp_jax.core.lanes import BLOCK, in_lanes
 from boomdp_jax.core.unmerged import unmerged
 from boomdp_jax.physics.contact_coupling import coupled_substep, is_coupled
 from boomdp_jax.physics.contact_rows import Ease
@@ -25,6 +25,11 @@ from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
 from boomdp_jax.physics.step_info import StepInfo, report
 from boomdp_jax.physics.tournament import as_rounds, num_rounds, num_seats, stacked
+
+# Bodies without contact that are worked on together. Their arrays are small: pairs that
+# are tied take 3.5 us a step 420 at a time and 5.5 us 128 at a time, triples 9.9 us 280
+# at a time and 12.9 us 128 at a time; of five it makes no difference.
+_BODIES_IN_BLOCK = 840
 
 
 class World(NamedTuple):
@@ -52,7 +57,7 @@ def prepare_step_of_world(
         ValueError: the scene has contact, and the params do not say what it is like.
     """
     _check(scene, params)
-    return in_lanes(_world, scene, params, length)
+    return in_lanes(_world, scene, params, length, block=_block(scene))
 
 
 def world_step(
@@ -61,7 +66,9 @@ def world_step(
     """Advance a world by one step; the arguments are those of `step`."""
     sizes = (scene.num_substeps, scene.num_sweeps)
     out, impulses = in_lanes(
-        _rollout_of, world, state, wrench[None], cache, static=sizes
+        *(_rollout_of, world, state, wrench[None], cache),
+        static=sizes,
+        block=_block(scene),
     )
     pose, twist, *reported, push = jax.tree.map(lambda leaf: leaf[0], out)
     info = StepInfo(*reported, cache=impulses, contact_wrench=push)
@@ -93,9 +100,17 @@ def world_rollout(
 ) -> tuple[State, StepInfo]:
     """Advance a world by many steps, given what `rollout` is given."""
     _check(scene, params)
-    out, _ = in_lanes(_rollout, scene, params, state, wrenches, length)
+    arguments = scene, params, state, wrenches, length
+    out, _ = in_lanes(_rollout, *arguments, block=_block(scene))
     pose, twist, *reported, push = out
     return State(pose, twist), StepInfo(*reported, contact_wrench=push)
+
+
+def _block(scene: Scene) -> int:
+    """Lanes that are worked on together on a CPU."""
+    if scene.collides is not None:
+        return BLOCK
+    return max(BLOCK, _BODIES_IN_BLOCK // scene.num_bodies)
 
 
 def _check(scene: Scene, params: Params) -> None:

@@ -1,11 +1,12 @@
 """Functions in lanes: any batch gives what one by one gives, derivatives too."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from boomdp_jax.core import lanes
 from boomdp_jax.core.lanes import in_lanes
 
 
@@ -28,8 +29,8 @@ def _arguments(num, seed=0):
     return (x, y), weights, jnp.asarray(rng.random(num) > 0.5)
 
 
-def _call(tree, weights, flag):
-    return in_lanes(_mix, tree, weights, flag, static=(2,))
+def _call(tree, weights, flag, block=128):
+    return in_lanes(_mix, tree, weights, flag, static=(2,), block=block)
 
 
 def _plain(tree, weights, flag):
@@ -38,14 +39,13 @@ def _plain(tree, weights, flag):
 
 
 @pytest.mark.parametrize("block", [256, 3])
-def test_batch_is_what_each_lane_gives(block, monkeypatch):
-    monkeypatch.setattr(lanes, "_BLOCK", block)
-    jax.clear_caches()
+def test_batch_is_what_each_lane_gives(block):
+    call = functools.partial(_call, block=block)
     tree, weights, flags = _arguments(7)
-    found = jax.jit(jax.vmap(_call))(tree, weights, flags)
+    found = jax.jit(jax.vmap(call))(tree, weights, flags)
     expected = jax.vmap(_plain)(tree, weights, flags)
     assert jax.tree.all(jax.tree.map(np.allclose, found, expected))
-    nested = jax.vmap(jax.vmap(_call, (0, None, 0)), (None, 0, None))
+    nested = jax.vmap(jax.vmap(call, (0, None, 0)), (None, 0, None))
     deep = nested(tree, weights, flags)
     wanted = jax.vmap(jax.vmap(_plain, (0, None, 0)), (None, 0, None))(
         tree, weights, flags
