@@ -4,7 +4,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 FloatScalar = Float[Array, ""]
 IntScalar = Int[Array, ""]
@@ -12,7 +12,15 @@ BoolScalar = Bool[Array, ""]
 Vector2 = Float[Array, "*batch 2"]
 Key = PRNGKeyArray
 
-__all__ = ["BoolScalar", "FloatScalar", "IntScalar", "Key", "Vector2", "on_device"]
+__all__ = [
+    "BoolScalar",
+    "FloatScalar",
+    "IntScalar",
+    "Key",
+    "Vector2",
+    "on_device",
+    "row_of",
+]
 
 
 def on_device(values: Any, dtype: type | np.dtype = float) -> Array:
@@ -30,3 +38,21 @@ def on_device(values: Any, dtype: type | np.dtype = float) -> Array:
     """
     # A copy, since the result may share its memory.
     return jax.device_put(np.array(values, jax.dtypes.canonicalize_dtype(dtype)))
+
+
+@jax.jit
+def row_of(tree: PyTree, index: int | IntScalar) -> PyTree:
+    """A row of every array of a tree, in one call.
+
+    Array by array, each takes a third of a millisecond: a belief has sixty.
+
+    Args:
+        tree: of arrays with a common leading axis.
+        index: of the row.
+
+    Returns:
+        The arrays without that axis.
+    """
+    return jax.tree.map(
+        lambda leaf: jax.lax.dynamic_index_in_dim(leaf, index, keepdims=False), tree
+    )

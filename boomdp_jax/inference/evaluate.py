@@ -165,7 +165,7 @@ def log_prior_density(
 ) -> np.ndarray:
     """The same as `StructureTarget.log_prior_density`, of many points on the host."""
     period = np.asarray(targets.period, float)[index]
-    slots, slot = np.asarray(targets.structures[0]), np.asarray(targets.slot[0])
+    slots, slot = np.asarray(targets.structures)[0], np.asarray(targets.slot)[0]
     active = np.concatenate([slots, np.ones((len(slots), 1), bool)], axis=1)
     normal = -0.5 * z**2 - 0.5 * np.log(2.0 * np.pi)
     uniform = -np.log(np.where(period > 0, period, 1.0))

@@ -100,13 +100,13 @@ class Host(NamedTuple):
     def of(cls, targets: StructureTarget) -> "Host":
         """Read it off stacked targets."""
         structures, slot = (
-            np.asarray(targets.structures[0]),
-            np.asarray(targets.slot[0]),
+            np.asarray(targets.structures)[0],
+            np.asarray(targets.slot)[0],
         )
         active = np.concatenate(
             [structures, np.ones((len(structures), 1), bool)], axis=1
         )
-        period = np.asarray(targets.period[0], float)
+        period = np.asarray(targets.period, float)[0]
         likelihood: Any = targets.log_likelihood
         scale = np.asarray(likelihood.coordinates.scales.noise, float)
         reference = np.asarray(likelihood.reference, float)

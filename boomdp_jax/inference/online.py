@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from boomdp_jax.core.arrays import BoolScalar, Key, on_device
+from boomdp_jax.core.arrays import BoolScalar, Key, on_device, row_of
 from boomdp_jax.core.checked_input import positive_seconds, whole_number
 from boomdp_jax.core.history import History, make_history
 from boomdp_jax.inference.arguments import check_history
@@ -288,11 +288,10 @@ class OnlineBelief:
         found = []
         for group, stacked in zip(self._groups, belief.blocks, strict=True):
             for place, index in enumerate(group):
-                old = jax.tree.map(lambda leaf, i=place: leaf[i], stacked)
                 beliefs[index], info = refit_block(
                     jax.random.fold_in(refit_key, index),
                     self._settings,
-                    old,
+                    row_of(stacked, place),
                     self._blocks[index].bodies,
                     belief.history,
                     num_rows,
@@ -367,7 +366,7 @@ class OnlineBelief:
     def _parts(self, belief: BeliefState) -> list[tuple[Block, BlockBelief]]:
         """Blocks, and what is believed of each."""
         return [
-            (self._blocks[index], jax.tree.map(lambda leaf, i=place: leaf[i], stacked))
+            (self._blocks[index], row_of(stacked, place))
             for group, stacked in zip(self._groups, belief.blocks, strict=True)
             for place, index in enumerate(group)
         ]

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from boomdp_jax.core.arrays import Key, on_device
+from boomdp_jax.core.arrays import Key, on_device, row_of
 from boomdp_jax.core.checked_input import one_number, whole_number
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.arguments import check_spec
@@ -291,7 +291,7 @@ def assemble_belief(
     """
     targets, filtered = levelled.targets, levelled.filtered
     mixture = mixtures_over_levels(targets, mixtures)
-    mixture = jax.tree.map(lambda leaf: leaf[0], mixture)
+    mixture = row_of(mixture, 0)
     dtype = targets.log_prior.dtype
     integer = jnp.zeros((), int).dtype
     # Rows beyond the last one are padding.
@@ -301,7 +301,7 @@ def assemble_belief(
     num_levels = len(levelled.champion) // targets.structures.shape[1]
     starts = np.asarray(filtered.starts)[num_levels * int(mixture.structure[best])]
     targets, starts = in_whole_table(targets, starts, begin, capacity)
-    target = jax.tree.map(lambda leaf: leaf[0], targets)
+    target = row_of(targets, 0)
     num_bodies = starts.shape[1]
     num_all = len(levelled.champion)
     shape = (num_particles, num_bodies)

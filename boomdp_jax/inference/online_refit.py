@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from boomdp_jax.core.arrays import Key, on_device
+from boomdp_jax.core.arrays import Key, on_device, row_of
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.block import Block, stack_blocks
 from boomdp_jax.inference.filter_points import filter_points
@@ -122,7 +122,7 @@ def prior_belief(key: Key, settings: RefitSettings, block: Block) -> BlockBelief
         targets, champion, noise, filtered, num_levels_for(settings, bodies)
     )
     mixtures = start_mixtures(targets, modes)
-    target = jax.tree.map(lambda leaf: leaf[0], levelled.targets)
+    target = row_of(levelled.targets, 0)
     structure, z = _prior_draws(rng, target, settings.num_particles)
     capacity = likelihood.data.start.shape[1]
     belief = assemble_belief(levelled, mixtures, settings.num_particles, 0, 0, capacity)
