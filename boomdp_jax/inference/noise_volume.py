@@ -21,7 +21,7 @@ class OpenVolumes(NamedTuple):
     log_volume: np.ndarray
     """By how much a structure's evidence exceeds its density at a hypothesis near its
     best fit, but for a constant, `[noise]`; -1e30 for noises so far off that nothing
-    finite comes out."""
+    sound comes out."""
     variance: np.ndarray
     """Of each coordinate, one where it is not in use, `[noise, dim]`."""
 
@@ -57,15 +57,34 @@ def open_volumes(
     rate = (scale / noise.reading) ** 2
     weight = (NOISE_SHAPE + 0.5 * sums.num) / (rate + 0.5 * sums.square)
     gradient, matrix = sums.weighed(weight)
-    is_finite = np.isfinite(gradient.sum(axis=1) + matrix.sum(axis=(1, 2)))
-    gradient = np.where(is_finite[:, None], gradient, 0.0)
-    matrix = np.where(is_finite[:, None, None], matrix, 0.0)
     each, z = np.full(num, structure), np.tile(champion, (num, 1))
     gradient, matrix = with_prior(host, each, z, gradient, matrix)
+    is_sound = sound(gradient, matrix)
+    gradient = np.where(is_sound[:, None], gradient, 0.0)
+    matrix = np.where(is_sound[:, None, None], matrix, np.eye(len(champion)))
     return OpenVolumes(
-        np.where(is_finite, log_volume(gradient, matrix), -1e30),
+        np.where(is_sound, log_volume(gradient, matrix), -1e30),
         np.diagonal(np.linalg.inv(matrix), axis1=1, axis2=2),
     )
+
+
+def sound(gradient: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Where an expansion is finite, and its matrix positive definite.
+
+    That of a noise which weighs readings a million times too much is rounded until it
+    is not.
+
+    Args:
+        gradient: `[point, dim]`.
+        matrix: `[point, dim, dim]`.
+    """
+    is_finite = np.isfinite(gradient.sum(axis=1) + matrix.sum(axis=(1, 2)))
+    safe = np.where(is_finite[:, None, None], matrix, np.eye(matrix.shape[-1]))
+    # Of the same signs, but of entries that do not differ by many powers of ten.
+    scale = np.sqrt(np.abs(np.diagonal(safe, axis1=1, axis2=2)))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    scaled = safe / (scale[:, :, None] * scale[:, None, :])
+    return is_finite & (np.linalg.eigvalsh(scaled)[:, 0] > 0.0)
 
 
 def log_volume(gradient: np.ndarray, matrix: np.ndarray) -> np.ndarray:

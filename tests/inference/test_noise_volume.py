@@ -12,7 +12,7 @@ from boomdp_jax.inference.fit import Fits, FitSettings, Host, climb, normal_equa
 from boomdp_jax.inference.fit_noise import with_gains
 from boomdp_jax.inference.noise_level import NoiseFit
 from boomdp_jax.inference.noise_levels import _parts
-from boomdp_jax.inference.noise_volume import OpenVolumes, open_volumes
+from boomdp_jax.inference.noise_volume import OpenVolumes, open_volumes, sound
 from boomdp_jax.inference.online_fit import make_online_block, refit_settings
 from tests.inference.online_worlds import DT, NOISE, box_world, simulate
 
@@ -94,17 +94,34 @@ def test_volumes_are_those_of_a_filter_for_each_noise(problem):
     np.testing.assert_allclose(found.variance[:, ~in_use], 1.0)
 
 
-def test_noises_far_off_harm_no_others(problem):
+@pytest.mark.parametrize("shift", [300.0, -6.0, -9.0, -12.0, -300.0])
+def test_noises_far_off_harm_no_others(problem, shift):
     targets, fits, track, noise = problem
     vector = noise.vector.copy()
-    vector[0] = 300.0
+    vector[0] += shift
     known = (targets, PINNED, fits.z[0], fits.precision[0], track)
     near = open_volumes(*known, noise)
     found = open_volumes(*known, NoiseFit.of_vector(vector))
     assert np.isfinite(found.log_volume).all()
     assert np.isfinite(found.variance).all()
+    assert (found.variance > 0.0).all()
     np.testing.assert_allclose(found.log_volume[1:], near.log_volume[1:])
     np.testing.assert_allclose(found.variance[1:], near.variance[1:])
+
+
+def test_expansions_that_rounding_has_spoilt_are_told_from_others():
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0]
+
+    def of_curvatures(*values):
+        scale = np.diag([1.0, 1e6, 1e-6, 1.0])
+        return scale @ turn @ np.diag(values) @ turn.T @ scale
+
+    good = of_curvatures(1.0, 1e-6, 1e6, 3.0)
+    spoilt = of_curvatures(1.0, -1e-6, 1e6, 3.0)
+    matrix = np.stack([good, spoilt, good, np.full((4, 4), np.nan)])
+    gradient = np.ones((4, 4))
+    gradient[2, 1] = np.inf
+    assert sound(gradient, matrix).tolist() == [True, False, False, False]
 
 
 def test_parts_have_all_the_mass_in_order_of_what_is_open():
