@@ -23,6 +23,7 @@ MARKS: Mapping[str, tuple[float, ...]] = MappingProxyType(
 """By task; others have those of the cart."""
 
 _NUM_RESAMPLES, _COVERAGE = 1000, 0.95
+_LEAST_FOR_BAND = 5
 
 
 class Published(NamedTuple):
@@ -75,7 +76,8 @@ class LoadedRun(NamedTuple):
     decision: float
     """Median time of a decision [s]."""
     learning: float
-    """Mean time of learning from a step [s]; NaN where `decision` counts it in."""
+    """Median over episodes of the mean time of learning from a step [s]: the first ones
+    compile. NaN where `decision` counts it in."""
     world: str | None = None
     """What was true instead of what agents are told."""
 
@@ -142,9 +144,8 @@ def load_run(folder: str | os.PathLike) -> LoadedRun:
             f"{folder}: expected at least one episode, seed-00000.npz; got none yet"
         )
     planning = np.concatenate([record["plan_seconds"] for record in records])
-    learning = np.concatenate(
-        [record["learn_seconds"][record["action"] >= 0] for record in records]
-    )
+    taken = [record["learn_seconds"][record["action"] >= 0] for record in records]
+    learning = [np.mean(seconds) for seconds in taken if seconds.size]
     return LoadedRun(
         folder=folder,
         task=content["task"],
@@ -154,7 +155,7 @@ def load_run(folder: str | os.PathLike) -> LoadedRun:
         reward=np.stack([record["reward"] for record in records]),
         model_error=np.stack([record["model_error"] for record in records]),
         decision=float(np.median(planning[planning > 0])),
-        learning=float(np.mean(learning)),
+        learning=float(np.median(learning)) if learning else float("nan"),
         world=content.get("world"),
     )
 
@@ -204,7 +205,8 @@ def mean_band(
         values: of each episode; NaN where it was over, which does not count.
 
     Returns:
-        Mean, and lower and upper end; NaN where no episode has a value.
+        Mean, and lower and upper end. NaN where no episode has a value; ends also where
+        fewer have one than tell how much they scatter, if there were as many at first.
     """
     rng = np.random.default_rng(0)
     num = len(values)
@@ -217,8 +219,8 @@ def mean_band(
         drawn = (counts @ filled) / (counts @ is_there)
     tail = 50 * (1 - _COVERAGE)
     ends = np.full((2, values.shape[1]), np.nan)
-    has_any = is_there.any(axis=0)
-    ends[:, has_any] = np.nanpercentile(drawn[:, has_any], [tail, 100 - tail], axis=0)
+    tells = is_there.sum(axis=0) >= min(num, _LEAST_FOR_BAND)
+    ends[:, tells] = np.nanpercentile(drawn[:, tells], [tail, 100 - tail], axis=0)
     return mean, ends[0], ends[1]
 
 

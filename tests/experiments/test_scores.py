@@ -7,7 +7,7 @@ import pytest
 
 from boomdp_jax.cli import main as cli
 from boomdp_jax.core.json_file import write_json
-from boomdp_jax.core.npz_file import write_npz
+from boomdp_jax.core.npz_file import read_npz, write_npz
 from boomdp_jax.experiments.run import SCHEMA
 from boomdp_jax.experiments.scores import (
     CART_MARKS,
@@ -92,6 +92,31 @@ def test_the_band_is_that_of_a_mean():
     # An episode that is over does not count.
     values[50:, 0] = np.nan
     np.testing.assert_allclose(mean_band(values)[0][0], values[:50, 0].mean())
+
+
+def test_few_episodes_that_are_left_of_many_have_no_band():
+    values = np.random.default_rng(0).normal(size=(20, 3))
+    values[5:, 1] = values[4:, 2] = np.nan
+    mean, low, high = mean_band(values)
+    assert np.isfinite(mean).all()
+    assert (
+        np.isfinite(low).tolist() == np.isfinite(high).tolist() == [True, True, False]
+    )
+    # What had few from the beginning has one all the same.
+    assert np.isfinite(mean_band(values[:3])[1]).all()
+
+
+def test_time_to_learn_is_that_of_an_episode_that_compiles_nothing(tmp_path):
+    folder = write_run(tmp_path / "run", "physics", [[-1.0, -1.0, 0.0]] * 3)
+    path = folder / "seed-00000.npz"
+    record = read_npz(path)
+    record["learn_seconds"] = np.array([100.0, 0.03, 0.0])
+    write_npz(path, record)
+    assert load_run(folder).learning == pytest.approx(0.03)
+    nothing = write_run(tmp_path / "nothing", "physics", [[0.0, 0.0]])
+    path = nothing / "seed-00000.npz"
+    write_npz(path, read_npz(path) | {"plan_seconds": np.array([0.02, 0.0])})
+    assert np.isnan(load_run(nothing).learning)
 
 
 def test_published_curves_are_those_of_the_papers():
