@@ -10,7 +10,56 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.checked_input import check_real, has_shape
+from boomdp_jax.physics.params import Params
+from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
+
+
+def check_world(scene: Any, params: Any) -> None:
+    """Refuse what is no scene and no hypothesis about it, or many of them.
+
+    Args:
+        scene: what was given.
+        params: what was given.
+
+    Raises:
+        TypeError: no `Scene`, or no `Params`.
+        ValueError: a batch of either, or params of another number of bodies.
+    """
+    if not isinstance(scene, Scene):
+        has_one = isinstance(getattr(scene, "scene", None), Scene)
+        hint = "; its .scene is one" if has_one else ""
+        raise TypeError(f"scene: expected a Scene, got {type(scene).__name__}{hint}")
+    if not isinstance(params, Params):
+        raise TypeError(f"params: expected Params, got {type(params).__name__}")
+    if jnp.ndim(scene.area) != 1:
+        raise ValueError(
+            f"scene: expected one, got a batch of shape {jnp.shape(scene.area)[:-1]}; "
+            "jax.vmap goes over a batch"
+        )
+    num = scene.num_bodies
+    for name, array, num_axes in (
+        ("density", params.density, 1),
+        ("wheel.active", params.wheel.active, 2),
+        ("ground.active", params.ground.active, 2),
+    ):
+        shape = jnp.shape(array)
+        if len(shape) == num_axes and shape[0] == num:
+            continue
+        many = len(shape) > num_axes and shape[-num_axes] == num
+        hint = "; jax.vmap goes over a batch of hypotheses" if many else ""
+        expected = f"({num}, slots)" if num_axes == 2 else f"({num},)"
+        raise ValueError(
+            f"params.{name}: expected shape {expected} in a scene of {num} "
+            f"bod{'y' if num == 1 else 'ies'}, got {shape}{hint}"
+        )
+    for name in ("revolute", "distance", "prismatic", "weld"):
+        slots = getattr(params, name)
+        if slots is not None and jnp.ndim(slots.active) != 1:
+            raise ValueError(
+                f"params.{name}.active: expected shape (slots,), got "
+                f"{jnp.shape(slots.active)}; jax.vmap goes over a batch of hypotheses"
+            )
 
 
 def checked_state(num_bodies: int, state: Any, name: str = "state") -> State:

@@ -55,6 +55,7 @@ from jaxtyping import Array, Float
 
 from boomdp_jax.physics.actuator import applied, without_actuator
 from boomdp_jax.physics.arguments import (
+    check_world,
     checked_length,
     checked_state,
     checked_step_length,
@@ -110,10 +111,11 @@ def step(
         The next state, and what there is to report.
 
     Raises:
-        TypeError: a state that is none.
-        ValueError: a state or a wrench of another shape, a length that is no single
-            number or below zero.
+        TypeError: a scene, params or a state that is none.
+        ValueError: params of another number of bodies or a batch of them, a state or a
+            wrench of another shape, a length that is no single number or below zero.
     """
+    check_world(scene, params)
     state = checked_state(scene.num_bodies, state)
     wrench = checked_wrench(scene.num_bodies, wrench)
     length = checked_step_length(scene.dt if dt is None else dt, state.pose.dtype)
@@ -148,8 +150,11 @@ def prepare_step(
         that it may be batched by `vmap` and given to compiled functions.
 
     Raises:
-        ValueError: a length that is no single number or below zero.
+        TypeError: a scene or params that are none.
+        ValueError: params of another number of bodies or a batch of them, a length that
+            is no single number or below zero.
     """
+    check_world(scene, params)
     length = checked_step_length(scene.dt if dt is None else dt, scene.area.dtype)
     return Partial(_without_cache, _step_of(scene, params, length))
 
@@ -209,9 +214,11 @@ def rollout(
         The states after each step and their reports, with a leading time axis.
 
     Raises:
-        TypeError: a state that is none.
-        ValueError: a state, wrenches or lengths of another shape.
+        TypeError: a scene, params or a state that is none.
+        ValueError: params of another number of bodies or a batch of them, a state,
+            wrenches or lengths of another shape.
     """
+    check_world(scene, params)
     state = checked_state(scene.num_bodies, state)
     wrenches = checked_wrenches(scene.num_bodies, wrenches)
     length = checked_length(

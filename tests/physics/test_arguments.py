@@ -1,14 +1,17 @@
 """What the engine says to states, wrenches and noise of the wrong shape."""
 
+import dataclasses
 import subprocess
 import sys
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from boomdp_jax.physics import State
+from boomdp_jax.physics import State, scene_spec_from_dict
 from boomdp_jax.physics.arguments import (
+    check_world,
     checked_length,
     checked_state,
     checked_wrench,
@@ -55,6 +58,35 @@ def test_whole_numbers_are_floats():
     assert checked_state(2, whole).array.dtype == float
 
 
+def test_slots_of_other_bodies_and_batches_of_them_are_refused():
+    spec = scene_spec_from_dict(
+        {
+            "schema": "planar-scene-1",
+            "dt": 0.02,
+            "bodies": [
+                {"name": name, "shape": {"type": "circle", "radius": 0.1}, "density": 9}
+                for name in "ab"
+            ],
+            "constraints": [
+                {"type": "revolute", "a": "a", "b": "world"}
+                | {"anchor_a": [0.0, 0.0], "anchor_b": [0.0, 0.0]},
+                {"type": "ground", "a": "b", "dry": 0.1},
+            ],
+        }
+    )
+    params = spec.params()
+    check_world(spec.scene, params)
+    one = jax.tree.map(lambda leaf: leaf[:1], params.ground)
+    mixed = dataclasses.replace(params, ground=one)
+    expected = r"params\.ground\.active: .* \(2, slots\) in .* 2 bodies, got \(1, 1\)"
+    with pytest.raises(ValueError, match=expected):
+        check_world(spec.scene, mixed)
+    many = jax.tree.map(lambda leaf: leaf[None], params.revolute)
+    expected = r"params\.revolute\.active: .* \(slots,\), got \(1, 1\); jax\.vmap"
+    with pytest.raises(ValueError, match=expected):
+        check_world(spec.scene, dataclasses.replace(params, revolute=many))
+
+
 # As users call the engine: without the checks of types that tests run under.
 PROGRAM = """
 import jax, numpy as np
@@ -70,7 +102,19 @@ def noise(*observation):
     return SimulationNoise(np.zeros(3), np.array(observation))
 quiet = noise(0.0, 0, 0, 0)
 key, wrenches = jax.random.key(0), np.zeros((4, 2, 3))
+scene, params, state = world
+lone = scene_spec_from_dict(
+    {"schema": "planar-scene-1", "dt": 0.02, "bodies": bodies[:1]}
+)
+many = jax.tree.map(lambda leaf: leaf[None], params)
 for call in (
+    lambda: step(spec, params, state, wrenches[0]),
+    lambda: step(params, scene, state, wrenches[0]),
+    lambda: rollout(scene, spec, state, wrenches),
+    lambda: prepare_step(scene, lone.params()),
+    lambda: step(lone.scene, params, lone.initial_state(), wrenches[0, :1]),
+    lambda: rollout(scene, many, state, wrenches),
+    lambda: step(jax.tree.map(lambda leaf: leaf[None], scene), *world[1:], wrenches[0]),
     lambda: step(*world, np.zeros((1, 3))),
     lambda: rollout(*world, np.zeros((4, 1, 3))),
     lambda: rollout(*world, wrenches, dt=np.full(3, 0.02)),
@@ -95,6 +139,14 @@ def test_the_engine_names_what_is_wrong():
         [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True
     )
     expected = (
+        "scene: expected a Scene, got SceneSpec; its .scene is one",
+        "scene: expected a Scene, got Params",
+        "params: expected Params, got SceneSpec",
+        "params.density: expected shape (2,) in a scene of 2 bodies, got (1,)",
+        "params.density: expected shape (1,) in a scene of 1 body, got (2,)",
+        "params.density: expected shape (2,) in a scene of 2 bodies, got (1, 2); "
+        "jax.vmap goes over a batch of hypotheses",
+        "scene: expected one, got a batch of shape (1,); jax.vmap",
         "wrench: expected shape (2, 3)",
         "wrenches: expected shape (time, 2, 3)",
         "dt: expected one number, or one for each of 4 steps",
