@@ -44,7 +44,7 @@ def on_device(values: Any, dtype: type | np.dtype = float) -> Array:
 def row_of(tree: PyTree, index: int | IntScalar) -> PyTree:
     """A row of every array of a tree, in one call.
 
-    Array by array, each takes a third of a millisecond: a belief has sixty.
+    Array by array, each takes a quarter of a millisecond: a belief has sixty.
 
     Args:
         tree: of arrays with a common leading axis.
