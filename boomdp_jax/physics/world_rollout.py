@@ -65,11 +65,8 @@ def world_step(
 ) -> tuple[State, StepInfo]:
     """Advance a world by one step; the arguments are those of `step`."""
     sizes = (scene.num_substeps, scene.num_sweeps)
-    out, impulses = in_lanes(
-        *(_rollout_of, world, state, wrench[None], cache),
-        static=sizes,
-        block=_block(scene),
-    )
+    arguments = world, state, wrench[None], cache
+    out, impulses = in_lanes(_rollout_of, *arguments, static=sizes, block=_block(scene))
     pose, twist, *reported, push = jax.tree.map(lambda leaf: leaf[0], out)
     info = StepInfo(*reported, cache=impulses, contact_wrench=push)
     return State(pose, twist), info
