@@ -40,7 +40,7 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 install_import_hook("boomdp_jax", "beartype.beartype")
 
-from boomdp_jax.core import side_by_side  # noqa: E402  After the hook.
+from boomdp_jax.core import kept_traces, side_by_side  # noqa: E402  After the hook.
 
 
 def pytest_sessionstart() -> None:
@@ -63,6 +63,8 @@ def _drop_programs() -> Iterator[None]:
     yield
     jax.clear_caches()
     side_by_side.forget_compiled()
+    # What a command line in a test turned on.
+    kept_traces.keep_traces(None)
     gc.collect()
 
 
