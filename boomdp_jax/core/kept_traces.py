@@ -64,9 +64,10 @@ def kept_trace(
     What comes from disk cannot be differentiated, nor mapped.
 
     Args:
-        function: of trees of arrays. One that a module has by its name is kept; others,
-            which may hold anything, are traced as ever, and so is what is given or
-            returns other trees than `tree_text` describes.
+        function: of trees of arrays. One that a module has by its name is kept, also
+            with some plain arguments given (`functools.partial`); others, which may
+            hold anything, are traced as ever, and so is what is given or returns other
+            trees than `tree_text` describes.
         static: names of arguments that are not, hashable.
 
     Returns:
@@ -96,17 +97,18 @@ def _kept(function, static: dict[str, Any], given: tuple[tuple, dict]):
 
     None if it cannot be kept.
     """
-    folder, name = _folder, _name_of(function)
-    if folder is None or name is None:
-        return None
+    folder = _folder
     types = [jax.typeof(leaf) for leaf in jax.tree.leaves(given)]
     try:
-        texts = [tree_text(given), static_text(sorted(static.items()))]
+        name, *texts = _name_of(function)
+        texts += [tree_text(given), static_text(sorted(static.items()))]
     except UnwritableError:
+        return None
+    if folder is None:
         return None
     known = json.dumps([name, *texts, *map(str, types), *_circumstances()])
     digest = hashlib.sha256(known.encode()).hexdigest()
-    path = folder / f"{function.__name__}-{digest}{TRACE_SUFFIX}"
+    path = folder / f"{name.rpartition(':')[2]}-{digest}{TRACE_SUFFIX}"
     read = _read(path)
     if read is not None:
         return read
@@ -155,12 +157,20 @@ def _write(path: pathlib.Path, exported, outcome: str) -> None:
         return
 
 
-def _name_of(function: Callable[..., Any]) -> str | None:
-    """Under which name a module has a function; None if it has not."""
+def _name_of(function: Callable[..., Any]) -> list[str]:
+    """Under which name a module has a function, and what of it was given.
+
+    Raises:
+        UnwritableError: none has it.
+    """
+    if isinstance(function, functools.partial):
+        given = [list(function.args), sorted(function.keywords.items())]
+        return [*_name_of(function.func), static_text(given)]
     name, module = getattr(function, "__qualname__", ""), function.__module__
     found = getattr(sys.modules.get(module), name, None)
-    is_there = function in (found, getattr(found, "__wrapped__", None))
-    return f"{module}:{name}" if is_there else None
+    if function not in (found, getattr(found, "__wrapped__", None)):
+        raise UnwritableError(f"{module} has no {name!r}")
+    return [f"{module}:{name}"]
 
 
 @jax.jit

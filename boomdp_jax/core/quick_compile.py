@@ -1,4 +1,4 @@
-"""Compile with cheaper optimisations, for programs that are run a few hundred times."""
+"""Compile what is run by name: from what was kept, and with cheaper optimisations."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -10,16 +10,11 @@ from jax.core import Tracer
 from boomdp_jax.core.kept_traces import are_traces_kept, kept_trace
 
 
-class QuickCompile:
-    """`jax.jit` at the first optimisation level of XLA's CPU compiler.
+class KeptJit:
+    """`jax.jit` that has from disk what it would trace, where programs are kept.
 
-    On programs of scalar arithmetic in loops, as physics and its likelihoods are, that
-    level compiles a fifth to a third faster and what it makes is as fast: loops are
-    vectorised at both (measured on an inference from cold: 37 s of processor time
-    instead of 47, and 4.0 s instead of 3.6 once compiled). Other backends keep their
-    defaults. Not for functions that are traced into another compiled program.
-
-    Where programs are kept (`keep_programs`), what they are made from is kept as well.
+    Of functions that a module has by their names, and of those with some arguments
+    given (`functools.partial`); see `keep_programs`.
 
     Args:
         function: of trees of arrays.
@@ -35,18 +30,41 @@ class QuickCompile:
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """Call the function, compiled at its first call for each backend."""
         backend = jax.default_backend()
-        # What comes from disk cannot be mapped.
+        # What comes from disk cannot be mapped or differentiated.
         is_kept = are_traces_kept() and not _is_traced((arguments, named))
         if (backend, is_kept) not in self._compiled:
             function = self._function
             self._compiled[backend, is_kept] = jax.jit(
                 kept_trace(function, self._static) if is_kept else function,
                 static_argnames=self._static,
-                compiler_options={"xla_backend_optimization_level": 1}
-                if backend == "cpu"
-                else {},
+                compiler_options=self._options(backend),
             )
         return self._compiled[backend, is_kept](*arguments, **named)
+
+    def _cache_size(self) -> int:
+        """How often it was compiled, as `jax.jit` tells it."""
+        return sum(compiled._cache_size() for compiled in self._compiled.values())
+
+    def _options(self, backend: str) -> dict[str, Any] | None:
+        """Of the compiler."""
+        del backend
+        return None
+
+
+class QuickCompile(KeptJit):
+    """The same at the first optimisation level of XLA's CPU compiler.
+
+    On programs of scalar arithmetic in loops, as physics and its likelihoods are, that
+    level compiles a fifth to a third faster and what it makes is as fast: loops are
+    vectorised at both (measured on an inference from cold: 37 s of processor time
+    instead of 47, and 4.0 s instead of 3.6 once compiled). For programs that are run a
+    few hundred times. Other backends keep their defaults. Not for functions that are
+    traced into another compiled program.
+    """
+
+    def _options(self, backend: str) -> dict[str, Any] | None:
+        """The level of optimisation."""
+        return {"xla_backend_optimization_level": 1} if backend == "cpu" else None
 
 
 def _is_traced(tree: Any) -> bool:

@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.core.checked_input import whole_number
 from boomdp_jax.core.history import History
+from boomdp_jax.core.quick_compile import KeptJit
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.random_motion import add_impulse, add_reading_noise
 from boomdp_jax.inference.summary import CHANNELS, plain
@@ -196,7 +197,7 @@ def _rollout_with_impulses(key, scene, params, state, wrenches, dt, impulse_scal
     return jax.lax.scan(advance, state, (keys, wrenches, dt))[1]
 
 
-@functools.partial(jax.jit, static_argnames=("horizons", "freedom"))
+@functools.partial(KeptJit, static=("horizons", "freedom"))
 def _predict_rows(
     key: Key,
     scene: Scene,

@@ -8,11 +8,12 @@ import numpy as np
 
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.core.history import History
+from boomdp_jax.core.quick_compile import KeptJit
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.predict import sample_readings, usable_starts
 from boomdp_jax.viz.style import BASELINE, PREDICTION, READING
 
-_sample = jax.jit(sample_readings)
+_sample = KeptJit(sample_readings)
 
 _LABELS = {
     "x": "x [m]",

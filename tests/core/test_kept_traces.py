@@ -1,5 +1,6 @@
 """What one process traced another has from disk, and nothing else."""
 
+import functools
 import json
 import os
 import subprocess
@@ -14,7 +15,7 @@ import pytest
 
 from boomdp_jax.core import kept_traces, make_history, save_history
 from boomdp_jax.core.kept_traces import are_traces_kept, keep_traces
-from boomdp_jax.core.quick_compile import QuickCompile
+from boomdp_jax.core.quick_compile import KeptJit, QuickCompile
 from boomdp_jax.physics import load_scene, rollout
 
 
@@ -128,6 +129,19 @@ def test_static_arguments_may_come_by_name(folder):
     start_anew()
     assert times(x=2.0, how="twice", number=20.0) == 80.0
     assert traced == []
+
+
+def test_arguments_may_be_given_beforehand(folder):
+    for _ in range(2):
+        for how, expected in (("twice", 40.0), ("thrice", 60.0)):
+            given = KeptJit(functools.partial(_times, how=how))
+            assert given(2.0, number=10.0) == expected
+            assert given._cache_size() == 1
+        assert traced == ["times", "times"]
+        jax.clear_caches()
+    given = KeptJit(functools.partial(_times, how=frozenset({1})))
+    assert given(2.0) == 6.0
+    assert len(list(folder.iterdir())) == 2
 
 
 def test_settings_of_jax_tell(folder):
