@@ -25,21 +25,23 @@ class KeptJit:
         functools.update_wrapper(self, function)
         self._function = function
         self._static = tuple(static)
-        self._compiled: dict[tuple[str, bool], Any] = {}
+        self._compiled: dict[tuple[str, bool, bool], Any] = {}
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """Call the function, compiled at its first call for each backend."""
-        backend = jax.default_backend()
-        # What comes from disk cannot be mapped or differentiated.
-        is_kept = are_traces_kept() and not _is_traced((arguments, named))
-        if (backend, is_kept) not in self._compiled:
+        # What is traced into another program is compiled with it. What comes from disk
+        # cannot be mapped or differentiated.
+        is_outermost = not _is_traced((arguments, named))
+        kind = jax.default_backend(), is_outermost, is_outermost and are_traces_kept()
+        if kind not in self._compiled:
+            backend, _, is_kept = kind
             function = self._function
-            self._compiled[backend, is_kept] = jax.jit(
+            self._compiled[kind] = jax.jit(
                 kept_trace(function, self._static) if is_kept else function,
                 static_argnames=self._static,
-                compiler_options=self._options(backend),
+                compiler_options=self._options(backend) if is_outermost else None,
             )
-        return self._compiled[backend, is_kept](*arguments, **named)
+        return self._compiled[kind](*arguments, **named)
 
     def _cache_size(self) -> int:
         """How often it was compiled, as `jax.jit` tells it."""
@@ -58,8 +60,7 @@ class QuickCompile(KeptJit):
     level compiles a fifth to a third faster and what it makes is as fast: loops are
     vectorised at both (measured on an inference from cold: 37 s of processor time
     instead of 47, and 4.0 s instead of 3.6 once compiled). For programs that are run a
-    few hundred times. Other backends keep their defaults. Not for functions that are
-    traced into another compiled program.
+    few hundred times. Other backends keep their defaults.
     """
 
     def _options(self, backend: str) -> dict[str, Any] | None:

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 from boomdp_jax.core.arrays import BoolScalar, Key, on_device, row_of
 from boomdp_jax.core.checked_input import positive_seconds, whole_number
 from boomdp_jax.core.history import History, make_history
-from boomdp_jax.core.quick_compile import KeptJit
+from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.inference.arguments import check_history
 from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.compile_ahead import signature
@@ -72,9 +72,9 @@ class Observed(NamedTuple):
 @functools.lru_cache(maxsize=64)
 def _compiled_step(
     bodies: tuple[tuple[tuple[int, ...], ...], ...], forgetting: float
-) -> KeptJit:
+) -> QuickCompile:
     """`refresh` of blocks by groups; beliefs of equal shapes share its programs."""
-    return KeptJit(functools.partial(refresh, bodies, forgetting))
+    return QuickCompile(functools.partial(refresh, bodies, forgetting))
 
 
 class OnlineBelief:

@@ -195,10 +195,14 @@ def test_errors_are_those_of_the_function(folder):
     assert fails(jnp.ones(3)).shape == (3,)
 
 
-def test_it_can_be_mapped(folder):
+def test_transformations_go_through(folder):
     x = jnp.linspace(0.0, 1.0, 5)
     batch = jax.vmap(lambda x: powers(Scaled(x, 2), 0.0).sine)(x[:, None])
     np.testing.assert_allclose(batch[:, 0], np.sin(x) ** 2, rtol=1e-14)
+    slope = jax.grad(lambda x: powers(Scaled(x[None], 2), 0.0).sine[0])(0.3)
+    np.testing.assert_allclose(slope, 2 * np.sin(0.3) * np.cos(0.3), rtol=1e-14)
+    inner = jax.jit(lambda x: powers(Scaled(x, 2), 0.0).sine)(x)
+    np.testing.assert_allclose(inner, np.sin(x) ** 2, rtol=1e-14)
 
 
 @pytest.mark.parametrize("content", [b"", b"[\n", b'["leaf"]\n\0\0\0\0\0\0\0\0'])
