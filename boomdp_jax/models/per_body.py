@@ -48,7 +48,7 @@ class PerBodyLearnt(NamedTuple):
     """Of each body's model."""
     draws: PyTree
     """Hypotheses, leading axes `hypothesis body`; drawn anew when a body's model learns
-    something."""
+    something, and now and then for a decision."""
     is_broken: tuple[bool, ...]
     """Whether a body has moved since its model was last told."""
     keys: Key
@@ -160,11 +160,19 @@ class PerBody(AbstractModel):
         return PerBodyLearnt(tuple(parts), draws, tuple(broken), key)
 
     def sample(self, key: Key, learnt: PerBodyLearnt, num_hypotheses: int) -> Belief:
-        """The draws at hand, of equal weight; they change when a body learns."""
-        del key, num_hypotheses
-        draws = jax.tree.map(jnp.asarray, learnt.draws)
-        num = jax.tree.leaves(draws)[0].shape[0]
-        return Belief(draws, jnp.zeros(num))
+        """The draws at hand, of equal weight; those of one body, whichever, are new.
+
+        Draws at hand change when their body learns. One that is pinned in all of them
+        is never pushed, and so would never learn that it is not.
+        """
+        del num_hypotheses
+        body_key, draw_key = jax.random.split(key)
+        body = int(jax.random.randint(body_key, (), 0, len(self.models)))
+        fresh = _drawn(
+            self.models[body], draw_key, learnt.parts[body], self.num_hypotheses
+        )
+        draws = jax.tree.map(_put(body), learnt.draws, fresh)
+        return Belief(jax.tree.map(jnp.asarray, draws), jnp.zeros(self.num_hypotheses))
 
     def transition(
         self,

@@ -12,8 +12,10 @@ from boomdp_jax.models import (
     ScenePhysics,
     TrueModel,
 )
+from boomdp_jax.models.model import AbstractModel
 from boomdp_jax.models.per_body import stacked
 from boomdp_jax.physics import State, step
+from boomdp_jax.planning import Belief
 
 from .worlds import cart, part, ride
 
@@ -109,6 +111,38 @@ def test_known_bodies_move_as_each_does_alone():
         lone = State(before.pose[body][None], before.twist[body][None])
         expected, _ = step(specs[body].scene, each, lone, wrench[body][None])
         np.testing.assert_allclose(found.array[body], expected.array[0], atol=1e-12)
+
+
+class Anything(AbstractModel):
+    """A model of a number that nothing is known of."""
+
+    is_compiled = False
+
+    def init(self, key):
+        return jnp.zeros(())
+
+    def update(self, learnt, state, wrench, next_state, *, starts_episode=False):
+        return learnt
+
+    def sample(self, key, learnt, num_hypotheses):
+        draws = jax.random.normal(key, (num_hypotheses,))
+        return Belief(draws, jnp.zeros(num_hypotheses))
+
+    def transition(self, key, hypothesis, state, wrench):
+        return state
+
+
+def test_no_body_is_taken_for_ever_for_what_it_was_at_first():
+    model = PerBody((Anything(),) * 4, None, num_hypotheses=3)
+    learnt = model.init(KEY)
+    keys = jax.random.split(jax.random.key(1), 60)
+    draws = np.array([model.sample(key, learnt, 3).hypotheses for key in keys])
+    is_new = np.any(draws != learnt.draws, axis=1)
+    assert np.all(is_new.sum(axis=1) == 1)
+    assert np.all(is_new.sum(axis=0) > 5)
+    # Others each time.
+    new = draws[is_new[:, 0], :, 0]
+    assert len(np.unique(new)) == new.size
 
 
 def test_bad_settings_are_refused():
