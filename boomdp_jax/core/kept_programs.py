@@ -16,9 +16,10 @@ import time
 from jax import config as settings_of_jax
 from jax.experimental.compilation_cache import compilation_cache
 
-from boomdp_jax.core.kept_traces import TRACE_SUFFIX, keep_traces
+from boomdp_jax.core.kept_traces import TRACE_FILES, keep_traces
 
 _MOST_DAYS = 30
+_IS_WANTED = "jax_enable_compilation_cache"
 _TOLD = "JAX_COMPILATION_CACHE_DIR"
 # JAX keeps what took a second to compile unless it is told otherwise. An inference has
 # twenty programs that take less, and eight seconds between them.
@@ -53,7 +54,8 @@ def keep_programs(folder: str | os.PathLike | None = None) -> pathlib.Path | Non
         return None
     _forget_old(path, f"*-{'[0-9a-f]' * 64}-cache")
     compilation_cache.set_cache_dir(str(path))
-    if settings_of_jax.values[_LEAST] == _LEAST_BY_DEFAULT:
+    is_told = _LEAST.upper() in os.environ
+    if settings_of_jax.values[_LEAST] == _LEAST_BY_DEFAULT and not is_told:
         settings_of_jax.update(_LEAST, _LEAST_SECONDS)
     # Whether there is a cache is looked up once, at the first compilation, which may
     # lie behind us.
@@ -65,15 +67,14 @@ def keep_programs(folder: str | os.PathLike | None = None) -> pathlib.Path | Non
 def _keep_traces_in(programs: pathlib.Path) -> None:
     """Keep what programs were traced from beside them, where JAX keeps anything."""
     is_elsewhere = "://" in os.environ.get(_TOLD, "")
-    wish = os.environ.get("JAX_ENABLE_COMPILATION_CACHE", "true")
-    if is_elsewhere or wish.lower() in ("n", "no", "f", "false", "off", "0"):
+    if is_elsewhere or not settings_of_jax.values[_IS_WANTED]:
         return
     folder = programs / "traces"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError:
         return
-    _forget_old(folder, f"*{TRACE_SUFFIX}")
+    _forget_old(folder, TRACE_FILES)
     keep_traces(folder)
 
 

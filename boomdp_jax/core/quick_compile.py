@@ -13,8 +13,8 @@ from boomdp_jax.core.kept_traces import are_traces_kept, kept_trace
 class KeptJit:
     """`jax.jit` that has from disk what it would trace, where programs are kept.
 
-    Of functions that a module has by their names, and of those with some arguments
-    given (`functools.partial`); see `keep_programs`.
+    Of functions that a module of this library has by their names, and of those with
+    some arguments given (`functools.partial`); see `keep_programs`.
 
     Args:
         function: of trees of arrays.

@@ -2,7 +2,7 @@
 
 JAX's own description of a tree (`jax.tree.structure`) cannot be stored. This one can,
 for the trees that the library is made of: tuples, lists, dictionaries, named tuples and
-modules of equinox, with plain values in static fields.
+modules of equinox, with plain values in static fields, all of types of its own.
 """
 
 import dataclasses
@@ -12,6 +12,9 @@ from typing import Any
 
 import equinox as eqx
 import jax
+
+# Whose types are described: of what may have changed since, nothing is.
+_OURS = ("boomdp_jax", "builtins")
 
 
 class UnwritableError(ValueError):
@@ -101,7 +104,14 @@ def _written_static(value: Any) -> list:
     raise UnwritableError(f"a {type(value).__name__} in a static field")
 
 
+def is_ours(module: str) -> bool:
+    """Whether a module is of this library, or of the language."""
+    return module.partition(".")[0] in _OURS
+
+
 def _path(cls: type) -> str:
+    if not is_ours(cls.__module__):
+        raise UnwritableError(f"{cls.__module__}:{cls.__qualname__}, which is not ours")
     path = f"{cls.__module__}:{cls.__qualname__}"
     try:
         found = _at(path)

@@ -23,6 +23,7 @@ Band = tuple[
 ]
 """Middle, lower and upper end."""
 
+_MOST_IN_A_ROW = 4
 _LEAST_ERROR = 1e-6
 """Of a prediction that is worth drawing [m]."""
 _LONG = 100
@@ -123,7 +124,7 @@ def plot_curves(
         ylabel="error of foretold positions, one step [m]",
         is_logarithmic=bool(positive),
     )
-    left.legend(frameon=False)
+    _name_curves(figure, left)
     figure.suptitle(title)
     return figure
 
@@ -158,6 +159,16 @@ def plot_sample_curves(
         (left, right), (position, velocity), labels, strict=True
     ):
         draw_curves(ax, bands, ylabel=label, is_logarithmic=True, sizes=sizes)
-    left.legend(frameon=False)
+    _name_curves(figure, left)
     figure.suptitle(title)
     return figure
+
+
+def _name_curves(figure: Any, ax: Any) -> None:
+    """In rows below: within the axes there may be no place that is free."""
+    handles, labels = ax.get_legend_handles_labels()
+    if handles:
+        num_rows = -(-len(labels) // _MOST_IN_A_ROW)
+        num_each = -(-len(labels) // num_rows)
+        place = "outside lower center"
+        figure.legend(handles, labels, loc=place, ncols=num_each, frameon=False)

@@ -3,6 +3,7 @@
 import functools
 import json
 import os
+import pathlib
 import subprocess
 import sys
 from typing import NamedTuple
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from boomdp_jax.core import kept_traces, make_history, save_history
+from boomdp_jax.core import kept_traces, make_history, save_history, tree_text
 from boomdp_jax.core.kept_traces import are_traces_kept, keep_traces
 from boomdp_jax.core.quick_compile import KeptJit, QuickCompile
 from boomdp_jax.physics import load_scene, rollout
@@ -57,11 +58,13 @@ def fails(x):
 @QuickCompile
 def solved(matrix, key):
     noise = jax.random.normal(key, matrix.shape[:1])
-    return jnp.linalg.solve(matrix, noise), jnp.linalg.eigh(matrix)
+    return jnp.linalg.solve(matrix, noise), tuple(jnp.linalg.eigh(matrix))
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path, monkeypatch):
+    # Functions of tests count as the library's.
+    monkeypatch.setattr(tree_text, "_OURS", ("boomdp_jax", "builtins", "tests"))
     start_anew()
     keep_traces(tmp_path)
     yield tmp_path
@@ -108,6 +111,7 @@ def test_everything_that_a_trace_depends_on_tells(folder):
         (powers, Scaled(x[:3], 3), np.array([0.5, 1.0, 2.0])),
         (powers, Scaled(x.astype(np.float32), 3), 0.5),
         (powers, Scaled(x.astype(np.float32), 3), np.array(0.5)),
+        (times, 2.0, "twice"),
         (times, x, "twice"),
         (times, x, "thrice"),
     ]
@@ -117,9 +121,13 @@ def test_everything_that_a_trace_depends_on_tells(folder):
     for (call, *arguments), before in zip(known, results, strict=True):
         after = call(*arguments)
         assert jax.tree.all(jax.tree.map(np.array_equal, before, after))
-        dtypes = jax.tree.map(lambda a, b: a.dtype == b.dtype, before, after)
-        assert jax.tree.all(dtypes)
+        assert jax.tree.map(jax.typeof, before) == jax.tree.map(jax.typeof, after)
     assert traced == []
+    keep_traces(None)
+    for (call, *arguments), before in zip(known, results, strict=True):
+        plain = call(*arguments)
+        assert jax.tree.all(jax.tree.map(np.array_equal, before, plain))
+        assert jax.tree.map(jax.typeof, before) == jax.tree.map(jax.typeof, plain)
     assert results[-1][-1] == 3.0
     assert results[-2][-1] == 2.0
 
@@ -205,16 +213,90 @@ def test_transformations_go_through(folder):
     np.testing.assert_allclose(inner, np.sin(x) ** 2, rtol=1e-14)
 
 
-@pytest.mark.parametrize("content", [b"", b"[\n", b'["leaf"]\n\0\0\0\0\0\0\0\0'])
+@QuickCompile
+def rotated(x):
+    return x[1:] * 2.0, x[:1]
+
+
+def test_results_are_called_with_without_another_compilation(folder):
+    for _ in range(2):
+        first, _ = rotated(jnp.ones(3))
+        assert not first.committed
+        size = rotated._cache_size()
+        x = jnp.ones(3)
+        for _ in range(3):
+            x = jnp.concatenate(rotated(x))
+        assert rotated._cache_size() == size
+        start_anew()
+
+
+def test_what_is_not_of_this_library_is_not_kept(folder, monkeypatch):
+    monkeypatch.setattr(tree_text, "_OURS", ("boomdp_jax", "builtins"))
+    assert times(2.0, "twice") == 4.0
+    assert list(folder.iterdir()) == []
+
+
+def test_nothing_is_kept_once_a_source_has_changed(folder, monkeypatch):
+    times(2.0, "twice")
+    start_anew()
+    monkeypatch.setattr(kept_traces, "_BEGUN", 0.0)
+    times(2.0, "twice")
+    assert traced == ["times"]
+    assert len(list(folder.iterdir())) == 1
+
+
+def test_settings_that_forbid_much_forbid_nothing_more(folder):
+    with jax.debug_key_reuse(True), jax.numpy_dtype_promotion("strict"):
+        assert rotated(jnp.ones(3))[1] == 1.0
+
+
+def test_without_compilation_the_function_itself_runs(folder):
+    times(2.0, "twice")
+    with jax.disable_jit():
+        assert times(3.0, "twice") == 6.0
+    assert traced == ["times", "times"]
+
+
+def test_wrong_arguments_are_refused_as_ever(folder):
+    with pytest.raises(TypeError, match="multiple values for argument 'how'"):
+        times(1.0, "twice", how="thrice")
+    with pytest.raises(TypeError, match=r"too many positional arguments|takes 2 pos"):
+        times(1.0, "twice", 5.0)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"[\n",
+        b"\xff\xff\n",
+        b'["no tree",[false]]\n',
+        b'["[\\"leaf\\"]",[false]]\n\0\0\0\0\0\0\0\0',
+        b'["[\\"none\\"]",[]]\nREST',
+    ],
+)
 def test_broken_files_are_written_again(folder, content):
     expected = times(2.0, "twice")
     (path,) = folder.iterdir()
     whole = path.read_bytes()
-    path.write_bytes(content)
+    rest = whole.partition(b"\n")[2]
+    path.write_bytes(content.replace(b"REST", rest))
     start_anew()
     assert times(2.0, "twice") == expected
     assert traced == ["times"]
     assert path.read_bytes() == whole
+
+
+def test_a_file_that_cannot_be_touched_is_read(folder, monkeypatch):
+    times(2.0, "twice")
+    start_anew()
+
+    def refuse(*_, **__):
+        raise PermissionError
+
+    monkeypatch.setattr(pathlib.Path, "touch", refuse)
+    assert times(2.0, "twice") == 4.0
+    assert traced == []
 
 
 def test_a_folder_that_is_gone_is_done_without(folder):

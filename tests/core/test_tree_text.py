@@ -9,12 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from boomdp_jax.core import tree_text as module
 from boomdp_jax.core.tree_text import (
     UnwritableError,
     static_text,
     tree_of_text,
     tree_text,
 )
+
+
+@pytest.fixture(autouse=True)
+def _types_of_tests_are_ours(monkeypatch):
+    monkeypatch.setattr(module, "_OURS", ("boomdp_jax", "builtins", "tests"))
 
 
 class Pair(NamedTuple):
@@ -91,6 +97,12 @@ def test_what_cannot_be_made_again_is_refused():
             tree_text(tree)
     with pytest.raises(UnwritableError, match="Color"):
         static_text(Color.RED)
+
+
+def test_types_of_others_are_refused(monkeypatch):
+    monkeypatch.setattr(module, "_OURS", ("boomdp_jax", "builtins"))
+    with pytest.raises(UnwritableError, match="test_tree_text:Pair, which is not ours"):
+        tree_text(Pair(1.0, 2.0))
 
 
 @pytest.mark.parametrize(
