@@ -107,7 +107,7 @@ def plot_curves(
     """
     from boomdp_jax.viz.snapshots import new_figure
 
-    figure = new_figure((10.0, 4.0))
+    figure = new_figure((10.0, 4.6))
     left, right = figure.subplots(1, 2)
     draw_curves(left, reward, ylabel="mean reward of a step, 95 % band")
     positive: dict[str, Band] = {}
@@ -152,7 +152,7 @@ def plot_sample_curves(
     """
     from boomdp_jax.viz.snapshots import new_figure
 
-    figure = new_figure((10.0, 4.0))
+    figure = new_figure((10.0, 4.6))
     left, right = figure.subplots(1, 2)
     labels = "held-out error of position [m]", "held-out error of velocity [m/s]"
     for ax, bands, label in zip(
