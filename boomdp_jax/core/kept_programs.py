@@ -30,6 +30,9 @@ _LEAST_BY_DEFAULT, _LEAST_SECONDS = 1.0, 0.1
 def keep_programs(folder: str | os.PathLike | None = None) -> pathlib.Path | None:
     """Let JAX find what it compiled in earlier runs, and keep what it compiles in this.
 
+    Also what this library's programs were traced from, and what took a tenth of a
+    second to compile, where JAX has its own limit of a whole one.
+
     Where `JAX_COMPILATION_CACHE_DIR` is set, it stays; with
     `JAX_ENABLE_COMPILATION_CACHE=false` nothing is kept. Programs of a month ago are
     deleted from a folder that is made here, to which nobody else should be able to

@@ -94,6 +94,22 @@ def test_programs_of_long_ago_are_deleted_and_nothing_else(tmp_path):
     assert other.exists()
 
 
+def test_so_are_traces_that_nobody_used(tmp_path):
+    folder = tmp_path / "boomdp_jax" / "programs" / "traces"
+    folder.mkdir(parents=True)
+    old = folder / f"_draw-{'0a' * 32}.trace"
+    new = folder / f"_draw-{'0b' * 32}.trace"
+    other = folder / "profile.trace"
+    for path in (old, new, other):
+        path.write_bytes(b"")
+    for path in (old, other):
+        os.utime(path, times=(time.time() - 40 * 86400,) * 2)
+    compile_something(tmp_path)
+    assert not old.exists()
+    assert new.exists()
+    assert other.exists()
+
+
 def test_the_command_line_keeps_what_it_compiles(tmp_path):
     scene = tmp_path / "scene.json"
     scene.write_text(

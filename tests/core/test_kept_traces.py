@@ -1,6 +1,7 @@
 """What one process traced another has from disk, and nothing else."""
 
 import functools
+import importlib.util
 import json
 import os
 import pathlib
@@ -82,6 +83,12 @@ def test_nothing_is_kept_unless_told(tmp_path):
     assert not are_traces_kept()
     powers(Scaled(jnp.ones(2), 2), 1.0)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_nothing_is_kept_where_it_cannot_be_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    keep_traces(tmp_path)
+    assert not are_traces_kept()
 
 
 def test_the_next_process_does_not_trace(folder):
