@@ -78,36 +78,31 @@ def test_a_folder_that_jax_was_told_of_stays():
     assert jax.config.jax_compilation_cache_dir == told
 
 
-def test_programs_of_long_ago_are_deleted_and_nothing_else(tmp_path):
-    folder = tmp_path / "boomdp_jax" / "programs"
+@pytest.mark.parametrize(
+    ("place", "old", "new", "other"),
+    [
+        (
+            ".",
+            f"jit_old-{'0a' * 32}-cache",
+            f"jit_new-{'0b' * 32}-cache",
+            "notes-cache",
+        ),
+        ("traces", f"a-{'0a' * 32}.trace", f"b-{'0b' * 32}.trace", "profile.trace"),
+    ],
+)
+def test_what_is_of_long_ago_is_deleted_and_nothing_else(
+    tmp_path, place, old, new, other
+):
+    folder = tmp_path / "boomdp_jax" / "programs" / place
     folder.mkdir(parents=True)
-    old = folder / f"jit_old-{'0a' * 32}-cache"
-    new = folder / f"jit_new-{'0b' * 32}-cache"
-    other = folder / "notes-cache"
-    for path in (old, new, other):
-        path.write_bytes(b"")
-    for path in (old, other):
-        os.utime(path, times=(time.time() - 40 * 86400,) * 2)
+    for name in (old, new, other):
+        (folder / name).write_bytes(b"")
+    for name in (old, other):
+        os.utime(folder / name, times=(time.time() - 40 * 86400,) * 2)
     compile_something(tmp_path)
-    assert not old.exists()
-    assert new.exists()
-    assert other.exists()
-
-
-def test_so_are_traces_that_nobody_used(tmp_path):
-    folder = tmp_path / "boomdp_jax" / "programs" / "traces"
-    folder.mkdir(parents=True)
-    old = folder / f"_draw-{'0a' * 32}.trace"
-    new = folder / f"_draw-{'0b' * 32}.trace"
-    other = folder / "profile.trace"
-    for path in (old, new, other):
-        path.write_bytes(b"")
-    for path in (old, other):
-        os.utime(path, times=(time.time() - 40 * 86400,) * 2)
-    compile_something(tmp_path)
-    assert not old.exists()
-    assert new.exists()
-    assert other.exists()
+    assert not (folder / old).exists()
+    assert (folder / new).exists()
+    assert (folder / other).exists()
 
 
 def test_the_command_line_keeps_what_it_compiles(tmp_path):
