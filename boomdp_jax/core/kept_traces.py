@@ -207,8 +207,8 @@ def _write(path: pathlib.Path, kept: _Kept) -> None:
     try:
         first = json.dumps([kept.outcome, kept.is_weak]).encode()
         atomic_write(path, first + b"\n" + kept.exported.serialize())
-    except (OSError, ValueError, NotImplementedError):
-        # Then the next process traces again.
+    except Exception:
+        # It is not what was asked for: the next process traces again.
         return
 
 
