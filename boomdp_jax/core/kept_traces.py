@@ -28,6 +28,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import export
 from jax.core import Tracer
 from jax.extend.core import Primitive
 from jax.interpreters import mlir
@@ -173,8 +174,7 @@ def _kept(function, static: dict[str, Any], structure, types: list) -> _Kept | N
         return leaves
 
     try:
-        export = importlib.import_module("jax.export").export
-        exported = export(jax.jit(of_leaves))(*types)
+        exported = export.export(jax.jit(of_leaves))(*types)
     except Exception:
         # It may not be of a kind that can be kept. If it is wrong, then tracing it as
         # ever says so.
@@ -189,7 +189,6 @@ def _read(path: pathlib.Path) -> _Kept | None:
     try:
         first, _, content = path.read_bytes().partition(b"\n")
         outcome, is_weak = json.loads(first)
-        export = importlib.import_module("jax.export")
         kept = _Kept(export.deserialize(bytearray(content)), outcome, tuple(is_weak))
         num = len(jax.tree.leaves(tree_of_text(outcome)))
         if not num == len(kept.is_weak) == len(kept.exported.out_avals):
