@@ -10,19 +10,20 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from boomdp_jax.core.holding import hold, runtime_one
-from boomdp_jax.core.one_loop import elementwise
 from boomdp_jax.physics.friction import Spin
-from boomdp_jax.physics.joints import (
-    Frames,
-    Rows,
-    bilateral_rows,
-    join,
-    of_body,
-    speed,
-)
+from boomdp_jax.physics.joints import Frames, bilateral_rows, join, of_body
 from boomdp_jax.physics.motion import Motion
 from boomdp_jax.physics.prepare import Drive, Prepared
-from boomdp_jax.physics.projection import drive_rows, ease_of, project
+from boomdp_jax.physics.projection import drive_rows, mobility, project
+from boomdp_jax.physics.row_algebra import (
+    PerRow,
+    Tied,
+    ease_of,
+    per_row,
+    speed,
+    tied,
+    with_arms,
+)
 from boomdp_jax.physics.trigonometry import rotated, sincos
 from boomdp_jax.physics.velocity_search import solve_velocity
 from boomdp_jax.physics.velocity_solve import Laws, Limits, VelocityProblem
@@ -69,7 +70,7 @@ def velocity_problem(
     sin, cos = sincos(motion.theta + half_turn)
     turn = rotated(None, half_turn)
     cos, sin, turn = held((cos, sin, turn))
-    rows_end = ease = is_steady = None
+    push = arms_end = ease = is_steady = None
     x, y, theta = motion[:3]
     middle = Frames(x + 0.5 * h * vx, y + 0.5 * h * vy, theta + half_turn, cos, sin)
     middle = held(middle)
@@ -85,9 +86,11 @@ def velocity_problem(
         )
         rows_end = bilateral_rows(prepared.joints, held(end))
         assert rows_end is not None
-        rows_end, is_steady = _steadied(prepared, rows_mid, rows_end)
-        ease = ease_of(prepared, rows_mid)
+        push, arms_end = (tied(rows, mass.shape[0]) for rows in (rows_mid, rows_end))
+        ease = ease_of(push, *mobility(prepared))
+        arms_end, is_steady = _steadied(prepared, push, ease, arms_end)
     laws, limits = _drives(prepared, middle, (vx, vy, spin))
+    further = [part.rows for part in (laws, limits) if part is not None]
     return VelocityProblem(
         mobile=mobile,
         mass=mass,
@@ -98,8 +101,9 @@ def velocity_problem(
         turn=turn,
         contacts=prepared.contacts,
         spins=prepared.spins,
+        push=join(push, *further),
+        end=join(arms_end, *further),
         rows_mid=rows_mid,
-        rows_end=rows_end,
         ease=ease,
         is_steady=is_steady,
         laws=laws,
@@ -108,8 +112,8 @@ def velocity_problem(
 
 
 def _steadied(
-    prepared: Prepared, mid: Rows, end: Rows
-) -> tuple[Rows, Bool[Array, " lane"]]:
+    prepared: Prepared, mid: Tied, ease: PerRow, end: Tied
+) -> tuple[Tied, Bool[Array, " lane"]]:
     """The rows at the end of the substep, or at mid-step where they turn too far.
 
     And whether none does.
@@ -118,39 +122,11 @@ def _steadied(
     that is of second order; when they are not (a fast spin, a short rod) the system may
     be anything but positive, and give energy.
     """
-    light, spinning = (
-        prepared.mobile / prepared.mass,
-        prepared.mobile / prepared.inertia,
-    )
-    ease_a, ease_b = (
-        (of_body(index, light), of_body(index, spinning)) for index in (mid.a, mid.b)
-    )
-    ja, jb, error, steady = elementwise(_steady, mid[2:], end[2:], ease_a, ease_b)
-    return Rows(mid.a, mid.b, ja, jb, error), jnp.all(steady > 0.0, axis=0)
-
-
-def _steady(mid: tuple, end: tuple, ease_a: tuple, ease_b: tuple) -> tuple:
-    """Of one row in scalars."""
-    (mid_a, mid_b, _), (end_a, end_b, error) = mid, end
-
-    def size(at_a, at_b):
-        total = 0.0
-        for (x, y, s), (light, spinning) in ((at_a, ease_a), (at_b, ease_b)):
-            total = total + (x * x + y * y) * light + s * s * spinning
-        return total
-
-    def change(p, q):
-        return tuple(v - u for u, v in zip(p, q, strict=True))
-
-    is_steady = size(change(mid_a, end_a), change(mid_b, end_b)) <= (
-        _MOST_CHANGE * size(mid_a, mid_b)
-    )
-
-    def choose(yes, no):
-        return tuple(jnp.where(is_steady, v, u) for u, v in zip(no, yes, strict=True))
-
-    steady = is_steady.astype(error.dtype)
-    return choose(end_a, mid_a), choose(end_b, mid_b), error, steady
+    change = ease_of(with_arms(jnp.subtract, end, mid), *mobility(prepared))
+    is_steady = change <= _MOST_CHANGE * ease
+    chosen = per_row(is_steady, mid)
+    steadied = with_arms(lambda new, old: jnp.where(chosen, new, old), end, mid)
+    return steadied, jnp.all(is_steady, axis=0)
 
 
 def _drives(
@@ -158,33 +134,36 @@ def _drives(
 ) -> tuple[Laws | None, Limits | None]:
     """What acts along the coordinates that joints leave free."""
     laws, limits = [], []
-    for drive, rows in drive_rows(prepared, middle):
+    for drive, row in drive_rows(prepared, middle):
+        rows = tied(row, prepared.mass.shape[0])
         moving = speed(rows, start)
         for spin, target in ((drive.friction, None), (drive.motor, drive.target)):
             if spin is not None:
                 aim = jnp.zeros_like(moving) if target is None else target
                 laws.append(Laws(rows, Spin(*spin), moving, aim))
         if drive.lower is not None:
-            limits.append(_range(prepared, drive, rows, moving))
+            limits.append(_range(prepared, drive, rows, row.error, moving))
     return join(*laws), join(*limits)
 
 
-def _range(prepared: Prepared, drive: Drive, rows: Rows, moving) -> Limits:
+def _range(
+    prepared: Prepared, drive: Drive, rows: Tied, middle: PerRow, moving: PerRow
+) -> Limits:
     """Speeds at which the ends of a range are met as the substep ends.
 
     Where the range is left already (a projection puts that right) it is not left
     further.
     """
     length = prepared.length[None]
-    # The coordinate is that at mid-step.
-    place = rows.error - 0.5 * length * moving
+    # From the coordinate at mid-step.
+    place = middle - 0.5 * length * moving
     lower: Any = drive.lower
     upper: Any = drive.upper
     return Limits(
         rows,
         jnp.minimum((lower - place) / length, 0.0),
         jnp.maximum((upper - place) / length, 0.0),
-        ease_of(prepared, rows),
+        ease_of(rows, *mobility(prepared)),
     )
 
 

@@ -34,8 +34,6 @@ Pair = tuple[PerSlot, PerSlot]
 # Below this separation of its anchors [m] a rod has no direction; it then acts along
 # no axis rather than along a random one.
 _TINY_LENGTH = 1e-9
-# Rows up to which a loop over them is written out.
-_FEW_ROWS = 6
 
 
 class Frames(NamedTuple):
@@ -160,51 +158,6 @@ def of_body(index: PerRow, values: Any) -> Any:
     for body in range(table.shape[0]):
         total = jnp.where((index == body)[None], table[body][:, None], total)
     return jax.tree.unflatten(treedef, list(total))
-
-
-def to_bodies(rows: "Rows", pushes: tuple, values: tuple) -> tuple:
-    """Add to each body what all rows bring to it.
-
-    Args:
-        rows: which bodies they tie.
-        pushes: what each brings to its first and to its second body, three numbers.
-        values: three numbers of every body.
-
-    Returns:
-        The values afterwards.
-    """
-    num_bodies, lanes = values[0].shape
-    body = jnp.arange(num_bodies, dtype=rows.a.dtype)[:, None]
-    table = jnp.stack(
-        [rows.a, *pushes[0], rows.b, *pushes[1]], axis=1
-    )  # One row of it is what one turn of the loop needs.
-
-    def add(row, totals):
-        a, *to_a = jax.lax.dynamic_index_in_dim(table, row, keepdims=False)[:4]
-        b, *to_b = jax.lax.dynamic_index_in_dim(table, row, keepdims=False)[4:]
-        return tuple(
-            total
-            + jnp.where(a[None] == body, p[None], 0.0)
-            + jnp.where(b[None] == body, q[None], 0.0)
-            for total, p, q in zip(totals, to_a, to_b, strict=True)
-        )
-
-    first = tuple(jnp.broadcast_to(v, (num_bodies, lanes)) for v in values)
-    num = table.shape[0]
-    if num <= _FEW_ROWS:
-        for row in range(num):
-            first = add(row, first)
-        return first
-    return jax.lax.fori_loop(0, num, add, first)
-
-
-def speed(rows: Rows, twist: tuple) -> PerRow:
-    """J w."""
-    return sum(
-        j * v
-        for index, push in ((rows.a, rows.ja), (rows.b, rows.jb))
-        for j, v in zip(push, of_body(index, tuple(twist)), strict=True)
-    )
 
 
 def bilateral_rows(joints: Joints, frames: Frames) -> Rows | None:

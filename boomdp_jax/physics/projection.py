@@ -7,33 +7,35 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from boomdp_jax.core.holding import hold, runtime_one
-from boomdp_jax.core.one_loop import elementwise
+from boomdp_jax.core.searched import searched
 from boomdp_jax.physics.body_friction import BodyAnswer
 from boomdp_jax.physics.joints import (
     Frames,
     Rows,
     bilateral_rows,
     join,
-    of_body,
     slide_rows,
-    speed,
     turn_rows,
 )
 from boomdp_jax.physics.motion import Motion
 from boomdp_jax.physics.prepare import Drive, Prepared
-from boomdp_jax.physics.small_linear import solve_in_lanes
-from boomdp_jax.physics.trigonometry import sincos
-from boomdp_jax.physics.velocity_solve import (
+from boomdp_jax.physics.row_algebra import (
+    PerBody,
+    PerRow,
+    columns_of,
     compliance_of,
     coupled,
-    moved_by_rows,
+    ease_of,
+    moved_by,
     on_diagonal,
+    speed,
+    tied,
 )
-
-PerRow = Float[Array, "row lane"]
+from boomdp_jax.physics.small_linear import solve_in_lanes
+from boomdp_jax.physics.trigonometry import sincos
 
 # Errors larger than this share of their levers are far: one that turns by half a radian
 # in a substep leaves a hundredth.
@@ -45,14 +47,10 @@ _MOST_PROJECTIONS = 6
 _MOST_TURN = 0.5
 
 
-def ease_of(prepared: Prepared, rows: Rows) -> PerRow:
-    """J M^-1 J^T of every row."""
-    columns = _columns(prepared, rows)
-    return sum(
-        j * c
-        for row, column in zip((rows.ja, rows.jb), columns, strict=True)
-        for j, c in zip(row, column, strict=True)
-    )
+def mobility(prepared: Prepared) -> tuple[PerBody, PerBody]:
+    """Speed per impulse and spin per angular impulse of every body, were it free."""
+    mobile = prepared.mobile
+    return mobile / prepared.mass, mobile / prepared.inertia
 
 
 def frames_of(prepared: Prepared, motion: Motion) -> Frames:
@@ -100,67 +98,74 @@ def project(prepared: Prepared, motion: Motion) -> tuple[Motion, Bool[Array, " l
     one = runtime_one(prepared.mass)
     if not has_rows(prepared):
         return motion, jnp.zeros(motion.x.shape[-1], bool)
-    is_far = _is_far(*jax.lax.stop_gradient((prepared, tuple(motion[:3]))))
-    shift = jax.lax.stop_gradient(_first_shift(prepared, motion, is_far))
-    place = tuple(p + q for p, q in zip(motion[:3], shift, strict=True))
-    place = _nearer(prepared, place)
+    place, (_, is_far) = searched(_put_nearer, _put_again, (prepared, motion[:3]), ())
     motion = jax.tree.map(lambda v: hold(v, one), Motion(*place, *motion[3:]))
     rows, counts = _rows(prepared, frames_of(prepared, motion), tuple(motion[3:]))
     assert rows is not None
-    lacking = speed(rows, tuple(motion[3:]))
+    lacking = speed(tied(rows, one.shape[0]), motion[3:])
     twist = _corrected(prepared, rows, counts, lacking, motion[3:])
     final = jax.tree.map(lambda v: hold(v, one), Motion(*motion[:3], *twist))
     return final, is_far
 
 
-def _first_shift(
-    prepared: Prepared, motion: Motion, is_far: Bool[Array, " lane"]
-) -> tuple:
-    """What brings poses near enough to their joints for a last linear correction.
+def _put_nearer(problem: tuple, given: tuple) -> tuple:
+    """Poses on their joints; and what the last correction moved, and if it was far.
 
-    Nothing, but where bodies turned far in a substep.
+    One linear correction will do, but where bodies turned far in a substep.
     """
-    constant, place = jax.lax.stop_gradient((prepared, tuple(motion[:3])))
+    del given
+    prepared, first = problem
 
     def goes_on(carry):
-        turn, _, is_far = carry
-        return jnp.any(is_far) & (turn < _MOST_PROJECTIONS)
+        turn, *_, is_open = carry
+        return jnp.any(is_open) & (turn <= _MOST_PROJECTIONS)
 
     def advance(carry):
-        turn, now, is_far = carry
-        new = _nearer(constant, now)
+        turn, place, shift, was_far, is_open = carry
+        new, is_far = _nearer(prepared, place)
         # Lanes that need none stay as they are, whatever the others do.
-        new = tuple(
-            jnp.where(is_far[None], p, q) for p, q in zip(new, now, strict=True)
+        new, shift = (
+            tuple(jnp.where(is_open[None], p, q) for p, q in zip(*pair, strict=True))
+            for pair in (
+                (new, place),
+                (tuple(p - q for p, q in zip(place, first, strict=True)), shift),
+            )
         )
-        return turn + 1, new, _is_far(constant, new)
+        was_far = jnp.where(turn == 0, is_far, was_far)
+        return turn + 1, new, shift, was_far, is_open & is_far
 
-    first = (jnp.zeros((), jnp.int32), place, is_far)
-    near = jax.lax.while_loop(goes_on, advance, first)[1]
-    return tuple(p - q for p, q in zip(near, place, strict=True))
+    zero, every = jnp.zeros_like(first[0]), jnp.ones(first[0].shape[-1], bool)
+    start = (jnp.zeros((), jnp.int32), first, (zero, zero, zero), ~every, every)
+    _, place, shift, is_far, _ = jax.lax.while_loop(goes_on, advance, start)
+    return place, (shift, is_far)
 
 
-def _is_far(prepared: Prepared, place: tuple) -> Bool[Array, " lane"]:
+def _put_again(problem: tuple, place: tuple, rest: tuple) -> tuple:
+    """The last of the corrections."""
+    del place
+    (prepared, first), (shift, _) = problem, rest
+    return _nearer(prepared, tuple(p + q for p, q in zip(first, shift, strict=True)))[0]
+
+
+def _nearer(prepared: Prepared, place: tuple) -> tuple[tuple, Bool[Array, " lane"]]:
+    """One linear correction of poses, in which no body turns too far.
+
+    And whether they were far.
+    """
     zero = jnp.zeros_like(place[0])
     motion = Motion(*place, zero, zero, zero)
     rows, counts = _rows(prepared, frames_of(prepared, motion), None)
     assert rows is not None
     assert counts is not None
     lever = jnp.abs(rows.ja[2]) + jnp.abs(rows.jb[2]) + _LEAST_LEVER
-    return jnp.any(jnp.abs(counts * rows.error) > _FAR * lever, axis=0)
-
-
-def _nearer(prepared: Prepared, place: tuple) -> tuple:
-    """One linear correction of poses, in which no body turns too far."""
-    zero = jnp.zeros_like(place[0])
-    motion = Motion(*place, zero, zero, zero)
-    rows, counts = _rows(prepared, frames_of(prepared, motion), None)
-    assert rows is not None
+    is_far = jnp.any(jnp.abs(counts * rows.error) > _FAR * lever, axis=0)
     change = _corrected(prepared, rows, counts, rows.error, (zero, zero, zero))
     turn = jnp.max(jnp.abs(change[2]), axis=0)
     is_wide = turn > _MOST_TURN
     share = jnp.where(is_wide, _MOST_TURN / jnp.where(is_wide, turn, 1.0), 1.0)
-    return tuple(p + share[None] * dp for p, dp in zip(place, change, strict=True))
+    share = share[None]
+    moved = tuple(p + share * dp for p, dp in zip(place, change, strict=True))
+    return moved, is_far
 
 
 def _rows(
@@ -191,32 +196,18 @@ def _rows(
     return join(*parts), join(*counts)
 
 
-def _columns(prepared: Prepared, rows: Rows) -> tuple:
-    """What a push along each row does to its two bodies."""
-    ease = (prepared.mobile / prepared.mass, prepared.mobile / prepared.inertia)
-    at_both = (of_body(index, ease) for index in (rows.a, rows.b))
-    return elementwise(_column, (rows.ja, rows.jb), *at_both)
-
-
-def _column(pushes: tuple, *eases: tuple) -> tuple:
-    return tuple(
-        BodyAnswer(light, light, spinning)(*push)
-        for push, (light, spinning) in zip(pushes, eases, strict=True)
-    )
-
-
 def _corrected(prepared: Prepared, rows: Rows, counts, errors, values) -> tuple:
     """Values after the smallest change, in kinetic energy, that zeroes errors."""
+    light, spinning = mobility(prepared)
+    one = runtime_one(prepared.mass)
 
-    def counting(push):
-        return tuple(counts * j for j in push)
+    def counting(arms):
+        return tuple(hold(counts * j, jnp.ones_like(j) * one[:1]) for j in arms)
 
-    one = jnp.ones_like(counts) * runtime_one(prepared.mass)[:1]
     rows = rows._replace(ja=counting(rows.ja), jb=counting(rows.jb))
-    rows = jax.tree.map(lambda v: hold(v, one), rows)
-    columns = _columns(prepared, rows)
-    matrix = coupled(rows, rows, columns)
-    ease = ease_of(prepared, rows)
-    matrix = matrix + on_diagonal(compliance_of(ease))
+    arms = tied(rows, one.shape[0])
+    columns = columns_of(arms, BodyAnswer(light, light, spinning), one)
+    ease = ease_of(arms, light, spinning)
+    matrix = coupled(arms, arms, columns) + on_diagonal(compliance_of(ease))
     impulse = solve_in_lanes(matrix, -counts * errors, ease > 0.0)
-    return moved_by_rows(tuple(values), rows, columns, impulse)
+    return moved_by(tuple(values), arms, columns, impulse)

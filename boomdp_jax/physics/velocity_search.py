@@ -5,8 +5,8 @@ is left on its own side, and one that sticks is already solved. After `NUM_NEWTO
 iterations few are left; in these, each step ends where nothing is left to gain along
 it.
 
-Derivatives are those of the last iteration with what it starts from held constant,
-which at the solution is the implicit function theorem, in both modes.
+Derivatives are those of one more iteration with what it starts from held constant
+(`core.searched`).
 
 All arrays are in lanes (`core.lanes`).
 """
@@ -19,9 +19,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from boomdp_jax.core.one_loop import elementwise
+from boomdp_jax.core.searched import searched
 from boomdp_jax.physics.body_friction import Felt, friction_of_bodies, into_frame
 from boomdp_jax.physics.friction import NUM_NEWTON
-from boomdp_jax.physics.joints import speed
+from boomdp_jax.physics.row_algebra import speed
 from boomdp_jax.physics.velocity_solve import (
     Solution,
     Solved,
@@ -78,14 +79,29 @@ def solve_from(
     has_friction = problem.contacts is not None or problem.spins is not None
     if not has_friction and problem.laws is None and problem.limits is None:
         return newton_step(problem, guess)
-    constant = jax.lax.stop_gradient(problem)
+    start = guess, is_open, jnp.asarray(turn, jnp.int32)
+    (twist, impulse), (before, is_settled) = searched(_search, _step, problem, start)
+    return Solved(Solution(twist, before, impulse), is_settled)
+
+
+def _step(problem: VelocityProblem, found: tuple, rest: tuple) -> tuple:
+    """The solution once more, by a last iteration."""
+    (twist, impulse), (before, _) = found, rest
+    solution = newton_step(problem, Solution(twist, before, impulse)).solution
+    return solution.twist, solution.impulse
+
+
+def _search(problem: VelocityProblem, start: tuple) -> tuple:
+    """Twists and impulses; and the twists before, and whether these are settled."""
+    guess, is_open, turn = start
+    has_any = _has_any(problem)
 
     def goes_on(carry):
-        turn, _, is_moving = carry
+        turn, _, is_moving, _ = carry
         return jnp.any(is_moving) & (turn < NUM_NEWTON + _NUM_DAMPED)
 
     def advance(carry):
-        turn, guess, is_moving = carry
+        turn, guess, is_moving, is_settled = carry
         is_limited = jnp.where(turn > 0, 1.0, 0.0).astype(problem.mass.dtype)
         is_late = turn >= NUM_NEWTON
         # What goes beyond rest does so no further than is good for it, so that nothing
@@ -95,8 +111,9 @@ def solve_from(
             for now, old in zip(guess.twist, guess.before, strict=True)
         )
         guess = guess._replace(before=before)
-        found = newton_step(constant, guess, is_limited).solution
-        share = jax.lax.cond(is_late, _good_share, _whole, constant, guess, found)
+        found = newton_step(problem, guess, is_limited).solution
+        is_near = ~_has_moved(guess.twist, found.twist, _UNSETTLED) | ~has_any
+        share = jax.lax.cond(is_late, _good_share, _whole, problem, guess, found)
         share = share[None]
         twist = tuple(
             v + share * (new - v)
@@ -113,15 +130,16 @@ def solve_from(
         found = jax.tree.map(
             lambda new, old: jnp.where(is_moving[None], new, old), found, guess
         )
-        return turn + 1, found, is_moving & has_moved
+        is_settled = jnp.where(is_moving, is_near, is_settled)
+        # All have one, which is all that those need where nothing slips.
+        goes_on = is_open & has_any & has_moved
+        return turn + 1, found, is_moving & goes_on, is_settled
 
-    start = jax.lax.stop_gradient(guess)
-    start = (jnp.asarray(turn, jnp.int32), start, _has_any(problem) & is_open)
-    guess = jax.lax.while_loop(goes_on, advance, start)[1]
-    solved = newton_step(problem, jax.lax.stop_gradient(guess))
-    found = jax.lax.stop_gradient(solved.solution.twist)
-    is_moving = _has_any(problem) & _has_moved(guess.twist, found, _UNSETTLED)
-    return solved._replace(is_settled=~is_moving)
+    every = jnp.ones_like(is_open)
+    _, found, _, is_settled = jax.lax.while_loop(
+        goes_on, advance, (turn, guess, every, every)
+    )
+    return (found.twist, found.impulse), (found.before, is_settled)
 
 
 def _whole(problem: VelocityProblem, guess: Solution, found: Solution) -> Array:

@@ -25,29 +25,37 @@ All arrays are in lanes (`core.lanes`), twists and rows in world axes.
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from boomdp_jax.core.holding import hold, runtime_one
 from boomdp_jax.core.one_loop import elementwise
 from boomdp_jax.physics.body_friction import (
-    BodyAnswer,
     Felt,
     answer_of_bodies,
     friction_of_bodies,
 )
 from boomdp_jax.physics.friction import Contact, Spin, limited
-from boomdp_jax.physics.joints import Rows, join, of_body, speed, to_bodies
+from boomdp_jax.physics.joints import Rows
+from boomdp_jax.physics.row_algebra import (
+    PerBody,
+    PerRow,
+    Tied,
+    Twist,
+    columns_of,
+    compliance_of,
+    coupled,
+    moved_by,
+    on_diagonal,
+    pushed,
+    speed,
+)
 from boomdp_jax.physics.small_linear import solve_in_lanes
-
-PerBody = Float[Array, "body lane"]
-PerRow = Float[Array, "row lane"]
-Twist = tuple[PerBody, PerBody, PerBody]
 
 
 class Laws(NamedTuple):
     """Frictions and motors of joints, each along a row."""
 
-    rows: Rows
+    rows: Tied
     friction: Spin
     """Impulses in place of forces."""
     start: PerRow
@@ -59,7 +67,7 @@ class Laws(NamedTuple):
 class Limits(NamedTuple):
     """Ranges of joints, each along a row."""
 
-    rows: Rows
+    rows: Tied
     least: PerRow
     """Speed at which the lower end is met when the substep ends."""
     most: PerRow
@@ -86,8 +94,12 @@ class VelocityProblem(NamedTuple):
     """`[contact, body, lane]`, impulses in place of forces."""
     spins: Spin | None
     """Likewise."""
+    push: Tied | None
+    """J_m of joints, of what acts along their free coordinates, and of their limits."""
+    end: Tied | None
+    """J_e of the same."""
     rows_mid: Rows | None
-    rows_end: Rows | None
+    """Of joints alone."""
     ease: PerRow | None
     """J M^-1 J^T of each row, zero for inactive ones."""
     is_steady: Bool[Array, " lane"] | None
@@ -142,82 +154,30 @@ def newton_step(
     friction = friction_of_bodies(problem.contacts, problem.spins, felt, is_limited)
     unknown, zero = jnp.ones(problem.mass.shape[-1], bool), jnp.zeros_like(problem.mass)
     given = (zero, zero, zero)
-    if guess.impulse is None:
+    push, end = problem.push, problem.end
+    if push is None or end is None or guess.impulse is None:
         _, free = answer_of_bodies(problem, friction, guess.twist, given)
         return Solved(Solution(free, guess.twist, None), unknown)
-    push, end, gain, diagonal, demand, is_needed = _system(problem, guess, is_limited)
-    pushes = tuple(tuple(j * guess.impulse for j in row) for row in (push.ja, push.jb))
-    given = to_bodies(push, pushes, given)
+    gain, diagonal, demand, is_needed = _system(problem, guess, is_limited)
+    given = pushed(given, push, guess.impulse)
     answer, free = answer_of_bodies(problem, friction, guess.twist, given)
-    columns, lacking = elementwise(
-        _column,
-        (push.ja, push.jb, end.ja, end.jb, gain, demand),
-        *(of_body(index, (answer, free)) for index in (push.a, push.b)),
-    )
+    one = runtime_one(problem.mass)
+    columns = columns_of(push, answer, one)
     matrix = gain[:, None] * coupled(end, push, columns)
     matrix = matrix + on_diagonal(diagonal)
-    lacking = lacking - diagonal * guess.impulse
+    lacking = demand - gain * speed(end, free) - diagonal * guess.impulse
     change = solve_in_lanes(matrix, lacking, is_needed)
-    twist = moved_by_rows(free, push, columns, change)
-    one = runtime_one(problem.mass)
+    twist = moved_by(free, push, columns, change)
     x, y, spin = (hold(v, one) for v in twist)
     impulse = guess.impulse + change
     return Solved(Solution((x, y, spin), guess.twist, impulse), unknown)
 
 
-def coupled(end: Rows, push: Rows, columns: tuple) -> Float[Array, "row row lane"]:
-    """J A^-1 J^T, given what pushes along the second do to their bodies."""
-
-    def between(i, j, answer):
-        return [jnp.where(i[:, None] == j[None], c[None], 0.0) for c in answer]
-
-    total = 0.0
-    for index, row in ((end.a, end.ja), (end.b, end.jb)):
-        parts = [between(index, push.a, columns[0]), between(index, push.b, columns[1])]
-        for j, p, q in zip(row, *parts, strict=True):
-            total = total + j[:, None] * (p + q)
-    return jnp.asarray(total)
-
-
-def moved_by_rows(
-    twist: tuple, rows: Rows, columns: tuple, impulse: PerRow
-) -> tuple[PerBody, PerBody, PerBody]:
-    """Twists after impulses along rows."""
-    pushes = tuple(tuple(c * impulse for c in column) for column in columns)
-    return to_bodies(rows, pushes, twist)
-
-
-def compliance_of(ease: PerRow) -> PerRow:
-    """Enough softness to keep redundant rows solvable; one for inactive rows."""
-    tiny = 0.03 * jnp.sqrt(jnp.finfo(ease.dtype).eps)
-    return jnp.where(ease > 0.0, tiny * ease, 1.0)
-
-
-def on_diagonal(values: PerRow) -> Float[Array, "row row lane"]:
-    """Diagonal matrices."""
-    unit = jnp.eye(values.shape[0], dtype=values.dtype)
-    return unit[..., None] * values[None]
-
-
-def _column(rows: tuple, at_a: tuple, at_b: tuple) -> tuple:
-    """What a push along a row does to its bodies, and what the row lacks without it."""
-    push_a, push_b, end_a, end_b, gain, demand = rows
-    columns = tuple(
-        BodyAnswer(*answer)(*push)
-        for push, (answer, _) in ((push_a, at_a), (push_b, at_b))
-    )
-    moving = sum(j * v for j, v in zip(end_a, at_a[1], strict=True))
-    moving = moving + sum(j * v for j, v in zip(end_b, at_b[1], strict=True))
-    return columns, demand - gain * moving
-
-
 def _system(problem: VelocityProblem, guess: Solution, is_limited) -> tuple:
-    """Rows that push and rows that are held, with g J_e w + d lambda = r."""
-    push, end, gain, diagonal, demand, needs = [], [], [], [], [], []
-    if problem.rows_mid is not None:
-        push.append(problem.rows_mid)
-        end.append(problem.rows_end)
-        ease: Any = problem.ease
+    """Of the rows, with g J_e w + d lambda = r: g, d, r, and which are needed."""
+    gain, diagonal, demand, needs = [], [], [], []
+    if problem.ease is not None:
+        ease = problem.ease
         gain.append(jnp.ones_like(ease))
         diagonal.append(compliance_of(ease))
         demand.append(jnp.zeros_like(ease))
@@ -228,8 +188,6 @@ def _system(problem: VelocityProblem, guess: Solution, is_limited) -> tuple:
         slope, offset = elementwise(
             law_line, laws.friction, laws.start, laws.target, *seen, is_limited
         )
-        push.append(laws.rows)
-        end.append(laws.rows)
         gain.append(slope)
         diagonal.append(jnp.ones_like(slope))
         demand.append(offset)
@@ -241,16 +199,10 @@ def _system(problem: VelocityProblem, guess: Solution, is_limited) -> tuple:
         parts = elementwise(
             _limit, *limits[1:], speed(limits.rows, guess.twist), pressure
         )
-        push.append(limits.rows)
-        end.append(limits.rows)
         for whole, part in zip((gain, diagonal, demand), parts, strict=True):
             whole.append(part)
         needs.append(parts[0] > 0.0)
-    return (
-        join(*push),
-        join(*end),
-        *(jnp.concatenate(parts) for parts in (gain, diagonal, demand, needs)),
-    )
+    return tuple(jnp.concatenate(parts) for parts in (gain, diagonal, demand, needs))
 
 
 def law_line(spin: Spin, start, target, now, before, is_limited) -> tuple:
