@@ -3,7 +3,8 @@
 At a solution one more step of Newton's method changes nothing, and its derivative with
 what it starts from held constant is that of the solution: the implicit function
 theorem. (A step from a little beside the solution leads to the solution all the same,
-so second derivatives, for which the solution moves, are right as well.) The step is
+so second derivatives, for which the solution moves, are right as well, if the step
+starts from the solution.) The step is
 only taken where there is a derivative to be worked out; what wants none compiles, and
 runs, without it.
 """
@@ -27,7 +28,8 @@ def searched(
 
     Args:
         search: from problem and what is given to the solution, a tree of floating
-            arrays, and to what else there is to know of it.
+            arrays, and to what else there is to know of it. It and the step take all
+            that they depend on as arguments.
         step: from problem, solution and the rest to a solution of the same form.
         problem: tree of arrays that the solution depends on.
         given: tree of arrays that only the search depends on.

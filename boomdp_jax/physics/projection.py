@@ -141,7 +141,11 @@ def _put_nearer(problem: tuple, given: tuple) -> tuple:
 
 
 def _put_again(problem: tuple, place: tuple, rest: tuple) -> tuple:
-    """The last of the corrections."""
+    """The last of the corrections.
+
+    Where there were several, what those before it moved is taken as given: derivatives
+    are then those of one correction from there.
+    """
     del place
     (prepared, first), (shift, _) = problem, rest
     return _nearer(prepared, tuple(p + q for p, q in zip(first, shift, strict=True)))[0]

@@ -31,7 +31,11 @@ _FEW_ROWS = 6
 
 
 class Levers(NamedTuple):
-    """J, with zeros for bodies that a row does not tie."""
+    """J, with zeros for bodies that a row does not tie.
+
+    Zero times what is not finite is not finite: a body that flew apart spoils all that
+    have joints in its world, which worlds of many bodies do not notice.
+    """
 
     x: Float[Array, "row body lane"]
     y: Float[Array, "row body lane"]
@@ -53,10 +57,9 @@ def tied(rows: Rows, num_bodies: int) -> Tied:
         return rows
     body = jnp.arange(num_bodies, dtype=rows.a.dtype)[None, :, None]
     at_a, at_b = rows.a[:, None] == body, rows.b[:, None] == body
-    # A row ties two bodies, or one to the world, where there is nothing to be held.
     return Levers(
         *(
-            jnp.where(at_a, p[:, None], jnp.where(at_b, q[:, None], 0.0))
+            jnp.where(at_a, p[:, None], 0.0) + jnp.where(at_b, q[:, None], 0.0)
             for p, q in zip(rows.ja, rows.jb, strict=True)
         )
     )
@@ -125,7 +128,7 @@ def columns_of(rows: Tied, answer: BodyAnswer, one: PerBody) -> Any:
     Args:
         rows: J.
         answer: A^-1 of every body.
-        one: from `runtime_one`.
+        one: from `runtime_one`, of the bodies' masses; rows with an index need none.
 
     Returns:
         Twists, for `coupled` and `moved_by`.
@@ -150,7 +153,7 @@ def coupled(end: Tied, push: Tied, columns: Any) -> Float[Array, "row row lane"]
 
     Args:
         end: J_e.
-        push: J_m.
+        push: J_m; levers need it no more, having the columns.
         columns: `columns_of` J_m.
     """
     if isinstance(end, Levers):

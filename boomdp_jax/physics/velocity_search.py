@@ -85,7 +85,7 @@ def solve_from(
 
 
 def _step(problem: VelocityProblem, found: tuple, rest: tuple) -> tuple:
-    """The solution once more, by a last iteration."""
+    """The solution once more, by a further iteration, for the sake of derivatives."""
     (twist, impulse), (before, _) = found, rest
     solution = newton_step(problem, Solution(twist, before, impulse)).solution
     return solution.twist, solution.impulse
@@ -101,34 +101,35 @@ def _search(problem: VelocityProblem, start: tuple) -> tuple:
         return jnp.any(is_moving) & (turn < NUM_NEWTON + _NUM_DAMPED)
 
     def advance(carry):
-        turn, guess, is_moving, is_settled = carry
+        turn, last, is_moving, is_settled = carry
         is_limited = jnp.where(turn > 0, 1.0, 0.0).astype(problem.mass.dtype)
         is_late = turn >= NUM_NEWTON
         # What goes beyond rest does so no further than is good for it, so that nothing
         # is taken to stick for that.
         before = tuple(
             jnp.where(is_late, now, old)
-            for now, old in zip(guess.twist, guess.before, strict=True)
+            for now, old in zip(last.twist, last.before, strict=True)
         )
-        guess = guess._replace(before=before)
+        guess = last._replace(before=before)
         found = newton_step(problem, guess, is_limited).solution
         is_near = ~_has_moved(guess.twist, found.twist, _UNSETTLED) | ~has_any
         share = jax.lax.cond(is_late, _good_share, _whole, problem, guess, found)
         share = share[None]
-        twist = tuple(
-            v + share * (new - v)
-            for v, new in zip(guess.twist, found.twist, strict=True)
+        twist, impulse = jax.tree.map(
+            lambda old, new, share=share: old + share * (new - old),
+            (guess.twist, guess.impulse),
+            (found.twist, found.impulse),
         )
         # The first has none before it that slipped.
         x, y, spin = (
             jnp.where(turn == 0, new, old)
             for new, old in zip(twist, found.before, strict=True)
         )
-        found = found._replace(twist=twist, before=(x, y, spin))
+        found = Solution(twist, (x, y, spin), impulse)
         has_moved = (turn == 0) | _has_moved(guess.twist, found.twist)
         # Lanes that are done stay as they are, whatever the others do.
         found = jax.tree.map(
-            lambda new, old: jnp.where(is_moving[None], new, old), found, guess
+            lambda new, old: jnp.where(is_moving[None], new, old), found, last
         )
         is_settled = jnp.where(is_moving, is_near, is_settled)
         # All have one, which is all that those need where nothing slips.

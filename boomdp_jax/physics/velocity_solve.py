@@ -101,7 +101,7 @@ class VelocityProblem(NamedTuple):
     rows_mid: Rows | None
     """Of joints alone."""
     ease: PerRow | None
-    """J M^-1 J^T of each row, zero for inactive ones."""
+    """J M^-1 J^T of each row of joints, zero for inactive ones."""
     is_steady: Bool[Array, " lane"] | None
     """Whether no row turns so far in this substep that it is taken at mid-step."""
     laws: Laws | None

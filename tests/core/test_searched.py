@@ -75,6 +75,33 @@ def test_batches():
     np.testing.assert_allclose(slopes, 0.5 / np.sqrt(squares), rtol=1e-5)
 
 
+def test_what_is_no_number_goes_with_the_problem_in_loops_and_lanes():
+    def search_mixed(problem, given):
+        square, scale, is_doubled, num, nothing = problem
+        assert nothing is None
+        factor = jnp.where(is_doubled, 2.0, 1.0) * num
+        return search((square, scale * factor), given)
+
+    def step_mixed(problem, root, num_steps):
+        square, scale, is_doubled, num, _ = problem
+        factor = jnp.where(is_doubled, 2.0, 1.0) * num
+        return step((square, scale * factor), root, num_steps)
+
+    def total(square):
+        @jax.checkpoint
+        def advance(carry, is_doubled):
+            problem = (square, jnp.ones(()), is_doubled, jnp.asarray(4), None)
+            return carry + searched(search_mixed, step_mixed, problem, 1.0)[0], None
+
+        return jax.lax.scan(advance, 0.0, jnp.asarray([True, False]))[0]
+
+    # sqrt(8 p) + sqrt(4 p).
+    squares = jnp.asarray([1.0, 9.0])
+    expected = (np.sqrt(8.0) + 2.0) * 0.5 / np.sqrt(squares)
+    slopes = jax.jit(jax.vmap(jax.grad(total)))(squares)
+    np.testing.assert_allclose(slopes, expected, rtol=1e-5)
+
+
 def test_without_a_derivative_there_is_no_further_step():
     def steps_in(function):
         return str(jax.make_jaxpr(function)(jnp.float32(9.0))).count(" div ")

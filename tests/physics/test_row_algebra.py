@@ -125,6 +125,21 @@ def test_coupling_of_two_sets_of_rows(form):
     close(vector_of(found).T, vector_of(twist) + moved)
 
 
+def test_a_body_tied_to_itself_feels_both_ends(form):
+    """A scene does not allow it, parameters may say it."""
+    rng = np.random.default_rng(6)
+    rows, twist = random_rows(rng), tuple(random(rng, 3, NUM_BODIES))
+    rows = rows._replace(b=jnp.where(rows.b == WORLD, rows.b, rows.a))
+    expected = [
+        sum(
+            (np.asarray(rows.ja[k][row]) + np.asarray(rows.jb[k][row])) * twist[k][a]
+            for k in range(3)
+        )
+        for row, (a, _) in enumerate(ENDS)
+    ]
+    close(speed(form(rows), twist), np.transpose(expected))
+
+
 def test_ease(form):
     rng = np.random.default_rng(3)
     rows = random_rows(rng)
