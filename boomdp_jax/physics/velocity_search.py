@@ -132,9 +132,9 @@ def _search(problem: VelocityProblem, start: tuple) -> tuple:
             lambda new, old: jnp.where(is_moving[None], new, old), found, last
         )
         is_settled = jnp.where(is_moving, is_near, is_settled)
-        # All have one, which is all that those need where nothing slips.
-        goes_on = is_open & has_any & has_moved
-        return turn + 1, found, is_moving & goes_on, is_settled
+        # All have one iteration, which is all that lanes need that are not open.
+        is_moving = is_moving & is_open & has_any & has_moved
+        return turn + 1, found, is_moving, is_settled
 
     every = jnp.ones_like(is_open)
     _, found, _, is_settled = jax.lax.while_loop(
