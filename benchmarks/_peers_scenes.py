@@ -27,8 +27,10 @@ WHEEL = {
 }
 NUM_BOXES, ROOM = 10, 2.4
 """How many boxes, and the side of the square room they are in [m]."""
-NUM_LINKS, LINK = 10, (0.1, 0.03)
-"""How many links a chain has, and their half extents [m]."""
+LINKS = {"two": 2, "ten": 10}
+"""How many links chains have."""
+LINK = (0.1, 0.03)
+"""Half extents of a link [m]."""
 NUM_JUDGED = 16
 """Worlds whose overlaps are measured."""
 
@@ -55,8 +57,8 @@ def all_cases(*, is_quick: bool = False) -> list[Case]:
             second; a program for ten boxes takes long to compile.
 
     Returns:
-        One body with a pin, and with a pin and a wheel; a pendulum; a chain of ten
-        links; ten boxes in a room, flying and piling up.
+        One body with a pin, and with a pin and a wheel; a pendulum; chains of two and
+        of ten links; ten boxes in a room, flying and piling up.
     """
     few, many = (1, 64, 1024), (1, 64, 1024, 4096)
     box_steps = 300
@@ -72,11 +74,11 @@ def all_cases(*, is_quick: bool = False) -> list[Case]:
         ),
         Case("pendulum, 300 steps", pendulum, 300, _hanging, _judge_pendulum, many),
     ]
-    if not is_quick:
-        chain = _chain()
-        cases.append(
-            Case("chain of ten, 60 steps", chain, 60, _falling, _judge_chain, few)
-        )
+    for name, num in {} if is_quick else LINKS.items():
+        starts = functools.partial(_falling, num)
+        judge = functools.partial(_judge_chain, num)
+        case = f"chain of {name}, 60 steps"
+        cases.append(Case(case, _chain(num), 60, starts, judge, few))
     rooms = [("piling up", piling, 0.3)]
     if not is_quick:
         rooms.append(("flying", flying, 1.0))
@@ -134,15 +136,13 @@ def _hanging(num_worlds: int) -> np.ndarray:
     return state
 
 
-def _links() -> chains.Chain:
-    return chains.bars(
-        NUM_LINKS, half_length=LINK[0], half_width=LINK[1], density=DENSITY
-    )
+def _links(num: int) -> chains.Chain:
+    return chains.bars(num, half_length=LINK[0], half_width=LINK[1], density=DENSITY)
 
 
-def _chain() -> SceneSpec:
+def _chain(num: int) -> SceneSpec:
     """Links pinned one to the next, the first to the world."""
-    names = [f"link {i}" for i in range(NUM_LINKS)]
+    names = [f"link {i}" for i in range(num)]
     near, far = [-LINK[0], 0.0], [LINK[0], 0.0]
     pin = {"type": "revolute"}
     pins = [
@@ -171,11 +171,11 @@ def _chain() -> SceneSpec:
     )
 
 
-def _falling(num_worlds: int) -> np.ndarray:
+def _falling(num_links: int, num_worlds: int) -> np.ndarray:
     """Straight and at rest, an eighth of a turn below level, or a little more."""
     angle = -np.pi / 4 - np.linspace(0.0, 0.1, num_worlds)
-    reach = (2 * np.arange(NUM_LINKS) + 1) * LINK[0]
-    state = np.zeros((num_worlds, NUM_LINKS, 6))
+    reach = (2 * np.arange(num_links) + 1) * LINK[0]
+    state = np.zeros((num_worlds, num_links, 6))
     state[..., 0], state[..., 1] = (
         np.outer(np.cos(angle), reach),
         np.outer(np.sin(angle), reach),
@@ -184,11 +184,11 @@ def _falling(num_worlds: int) -> np.ndarray:
     return state
 
 
-def _judge_chain(states: np.ndarray) -> list[Figure]:
+def _judge_chain(num_links: int, states: np.ndarray) -> list[Figure]:
     """The first world against the chain in its joint angles."""
-    rest = np.zeros(NUM_LINKS)
+    rest = np.zeros(num_links)
     times = DT * np.arange(states.shape[1] + 1)
-    angles, _ = chains.integrate(_links(), rest - np.pi / 4, rest, times)
+    angles, _ = chains.integrate(_links(num_links), rest - np.pi / 4, rest, times)
     wrong = np.angle(np.exp(1j * (states[0, :, :, 2] - angles[1:])))
     return [
         Figure("worst heading in a second", float(np.abs(wrong).max()), "rad", 1.0),

@@ -4,9 +4,8 @@ At a solution one more step of Newton's method changes nothing, and its derivati
 what it starts from held constant is that of the solution: the implicit function
 theorem. (A step from a little beside the solution leads to the solution all the same,
 so second derivatives, for which the solution moves, are right as well, if the step
-starts from the solution.) The step is
-only taken where there is a derivative to be worked out; what wants none compiles, and
-runs, without it.
+starts from the solution.) The step is only taken where there is a derivative to be
+worked out; what wants none compiles, and runs, without it.
 """
 
 import functools
