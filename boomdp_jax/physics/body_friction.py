@@ -77,7 +77,8 @@ def friction_of_bodies(
         is_limited: one, or zero to leave out the dry limits.
 
     Returns:
-        Nine entries and three; None where there is no friction.
+        Nine entries, three, and how many contacts of each body are taken as sticking
+        (`friction.limited`); None where there is no friction.
     """
     if contacts is not None and is_many(felt.turn[0].shape[0]):
         parts = elementwise(_friction, felt, [contacts], [], is_limited)
@@ -149,7 +150,7 @@ def _friction(felt: Felt, points: list[Contact], brakes: list[Spin], is_limited)
     # A twist at the start, half a turn before mid-step.
     start = (cos * start[0] - sin * start[1], sin * start[0] + cos * start[1], start[2])
     zero = jnp.zeros_like(cos)
-    a, b = [[zero] * 3 for _ in range(3)], [zero] * 3
+    a, b, num_back = [[zero] * 3 for _ in range(3)], [zero] * 3, zero
     for point in points:
         rows = (point.rolling, point.lateral)
         ends = [
@@ -165,7 +166,8 @@ def _friction(felt: Felt, points: list[Contact], brakes: list[Spin], is_limited)
             )
 
         u = seen(now)
-        scale, slope = limited(u, point.viscous, knee, seen(before))
+        scale, slope, back = limited(u, point.viscous, knee, seen(before))
+        num_back = num_back + back
         for i, row in enumerate(rows):
             k = [slope[i][j] * point.weight[j] for j in range(2)]
             force = scale * point.viscous[i] * u[i]
@@ -178,16 +180,16 @@ def _friction(felt: Felt, points: list[Contact], brakes: list[Spin], is_limited)
         u, old = (
             brake.weight * v[2] + (1.0 - brake.weight) * start[2] for v in (now, before)
         )
-        scale, ((k,),) = limited((u,), (brake.viscous,), (knee,), (old,))
-        k = k * brake.weight
+        scale, ((k,),), back = limited((u,), (brake.viscous,), (knee,), (old,))
+        k, num_back = k * brake.weight, num_back + back
         b[2] = b[2] - scale * brake.viscous * u
         a[2][2] = a[2][2] + k
-    return a, b
+    return a, b, num_back
 
 
 def _answer(mobile, mass, inertia, momentum, frame, friction, twist) -> tuple:
     """Of one body in scalars."""
-    a, b = friction
+    a, b, _ = friction
     a = [list(row) for row in a]
     for i, own in enumerate((mass, mass, inertia)):
         a[i][i] = a[i][i] + own

@@ -20,7 +20,8 @@ from boomdp_jax.physics.friction import is_reversed
 
 Pair = tuple[FloatScalar, FloatScalar]
 Triple = tuple[FloatScalar, FloatScalar, FloatScalar]
-# Entries xx, xy, xt, yx, yy, yt, tx, ty, tt of a 3 x 3 matrix, then a force.
+# Entries xx, xy, xt, yx, yy, yt, tx, ty, tt of a 3 x 3 matrix, then a force, then how
+# many contacts were taken as sticking (`friction.is_reversed`).
 Sums = tuple[FloatScalar, ...]
 
 
@@ -135,9 +136,14 @@ def track_sums(track: Track, motions: Motions) -> Sums:
     for i, (p, speed) in enumerate(zip(track.reach, speeds, strict=True)):
         ratio = (k * speed, m * side)
         square = ratio[0] ** 2 + ratio[1] ** 2
+        back = jnp.zeros_like(square)
         if old is not None:
             past = (k * old[0][i], m * old[1])
-            square = jnp.where(is_reversed(ratio, past), 1.0, square)
+            is_back = is_reversed(ratio, past)
+            square, back = (
+                jnp.where(is_back, 1.0, square),
+                jnp.where(is_back, 1.0, back),
+            )
         scale = slip_scale(square)
         loss = jnp.where(scale < 1.0, scale * scale, 0.0)
         cs, ds = scale * c, scale * d
@@ -151,14 +157,14 @@ def track_sums(track: Track, motions: Motions) -> Sums:
                 *(-g * b, ds - g * e, ds * q - g * pinch),
                 *(cs * p - turn * b, ds * q - turn * e),
                 cs * p * p + ds * q * q - turn * pinch,
-                *(f, g, turn),
+                *(f, g, turn, back),
             )
         )
     sums = [_total(column) for column in zip(*parts, strict=True)]
     if track.heading is None:
         return tuple(sums)
     force = out_of(track.heading, sums[9], sums[10])
-    return (*turned(track.heading, sums[:9]), *force, sums[11])
+    return (*turned(track.heading, sums[:9]), *force, *sums[11:])
 
 
 def feet_sums(feet: Feet, motions: Motions) -> Sums:
@@ -171,10 +177,14 @@ def feet_sums(feet: Feet, motions: Motions) -> Sums:
     for (p, q), c in zip(feet.arms, feet.viscous, strict=True):
         u, v = ux + p * spin, uy + q * spin
         square = (knee * u) ** 2 + (knee * v) ** 2
+        back = jnp.zeros_like(square)
         if old is not None:
             past = (knee * (old[0] + p * old[2]), knee * (old[1] + q * old[2]))
             is_back = is_reversed((knee * u, knee * v), past)
-            square = jnp.where(is_back, 1.0, square)
+            square, back = (
+                jnp.where(is_back, 1.0, square),
+                jnp.where(is_back, 1.0, back),
+            )
         scale = slip_scale(square)
         c, ratio = scale * c, knee * scale
         loss = jnp.where(scale < 1.0, c * ratio * ratio, 0.0)
@@ -187,14 +197,14 @@ def feet_sums(feet: Feet, motions: Motions) -> Sums:
                 c - loss * v * v,
                 c * q - loss * v * turn,
                 c * (p * p + q * q) - loss * turn * turn,
-                *(c * u, c * v, c * turn),
+                *(c * u, c * v, c * turn, back),
             )
         )
-    xx, xy, xt, yy, yt, tt, x, y, moment = (
+    xx, xy, xt, yy, yt, tt, *rest = (
         _total(column) for column in zip(*parts, strict=True)
     )
     xx, xy, xt, yy, yt, tt = (share * v for v in (xx, xy, xt, yy, yt, tt))
-    return xx, xy, xt, xy, yy, yt, xt, yt, tt, x, y, moment
+    return (xx, xy, xt, xy, yy, yt, xt, yt, tt, *rest)
 
 
 def _total(values):

@@ -16,20 +16,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from boomdp_jax.core.any_in_batch import any_in_batch
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar
 from boomdp_jax.core.one_loop import one_loop
-from boomdp_jax.physics.friction import NUM_NEWTON
 from boomdp_jax.physics.lone_body import LoneBody, Pivot
 from boomdp_jax.physics.lone_contacts import Pair, Triple, into, out_of
-from boomdp_jax.physics.lone_friction import (
-    Search,
-    SlidingProblem,
-    Stuck,
-    begin_search,
-    search_on,
-    solve_sliding,
-)
+from boomdp_jax.physics.lone_friction import SlidingProblem, Stuck, solve_sliding
+from boomdp_jax.physics.lone_search import Rubbing, search_friction
 from boomdp_jax.physics.motion import Motion
 from boomdp_jax.physics.trigonometry import heading_turn, rotated
 
@@ -121,41 +113,21 @@ def _search(
 ) -> tuple[Triple | None, LoneBody]:
     """The next solution for friction, and a body that needs no help to find it.
 
-    Few of a batch need all of Newton's iterations, and at most steps nobody does, so on
-    a CPU it goes on only while one does. What it finds is taken as given by the loop
-    that makes the step: derivatives have nothing to iterate. Other backends would have
-    to wait for every answer; there all iterations are made within that loop.
+    What it finds is taken as given by the loop that makes the step: derivatives have
+    nothing to iterate. On other backends than a CPU all iterations are made within that
+    loop: a search would have to wait for every answer to whether it is to go on.
     """
     if jax.default_backend() != "cpu":
         return None, body
     given = jax.lax.stop_gradient((body, now, force))
-    search = one_loop(_begun_search, *given, is_marked=False)
-
-    def goes_on(carry: tuple) -> BoolScalar:
-        turn, is_any_open, _ = carry
-        return is_any_open & (turn < NUM_NEWTON)
-
-    def go_on(carry: tuple) -> tuple:
-        turn, _, search = carry
-        search = one_loop(_searched_on, *given, search)
-        return turn + 1, any_in_batch(search.is_open > 0), search
-
-    start = jnp.ones((), jnp.int32), any_in_batch(search.is_open > 0), search
-    search = jax.lax.while_loop(goes_on, go_on, start)[2]
-    return search.found, body._replace(aid=None)
+    return search_friction(_rubbing, *given), body._replace(aid=None)
 
 
-def _begun_search(body: LoneBody, now: Motion | _Turned, force: tuple) -> Search:
+def _rubbing(body: LoneBody, now: Motion | _Turned, force: tuple) -> Rubbing:
+    """What such a search solves."""
+    problem, _ = _sliding(body, _turned_of(body, now), _impulse(body, force))
     assert isinstance(body.aid, Stuck)
-    problem, _ = _sliding(body, _turned_of(body, now), _impulse(body, force))
-    return begin_search(problem, body.aid, body.mass)
-
-
-def _searched_on(
-    body: LoneBody, now: Motion | _Turned, force: tuple, search: Search
-) -> Search:
-    problem, _ = _sliding(body, _turned_of(body, now), _impulse(body, force))
-    return search_on(problem, body.mass, search)
+    return Rubbing(problem, body.aid, body.mass)
 
 
 def _turned_of(body: LoneBody, now: Motion | _Turned) -> _Turned:

@@ -2,8 +2,7 @@ r"""Newton's method for the implicit velocity update, until it comes to rest.
 
 It starts from the solution in which everything sticks: from there a contact that slips
 is left on its own side, and one that sticks is already solved. After `NUM_NEWTON`
-iterations few are left; in these, each step ends where nothing is left to gain along
-it.
+iterations few are left, which go on by `LATE_SHARES` of them, `NUM_LATE` times.
 
 Derivatives are those of one more iteration with what it starts from held constant
 (`core.searched`).
@@ -12,30 +11,23 @@ All arrays are in lanes (`core.lanes`).
 """
 
 import functools
+import itertools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from boomdp_jax.core.one_loop import elementwise
 from boomdp_jax.core.searched import searched
-from boomdp_jax.physics.body_friction import Felt, friction_of_bodies, into_frame
-from boomdp_jax.physics.friction import NUM_NEWTON
-from boomdp_jax.physics.row_algebra import speed
+from boomdp_jax.physics.friction import LATE_SHARES, NUM_LATE, NUM_NEWTON
 from boomdp_jax.physics.velocity_solve import (
     Solution,
     Solved,
     VelocityProblem,
     first_guess,
-    law_line,
     newton_step,
 )
 
-# Iterations, beside `NUM_NEWTON`, for the few that have not come to rest by then.
-_NUM_DAMPED = 12
-# Evaluations with which the end of one of them is found.
-_NUM_NARROWED = 5
 # Relative change in the last iteration from which it has not.
 _UNSETTLED = 1e-3
 
@@ -96,27 +88,38 @@ def _search(problem: VelocityProblem, start: tuple) -> tuple:
     guess, is_open, turn = start
     has_any = _has_any(problem)
 
+    shares = jnp.asarray(LATE_SHARES, problem.mass.dtype)
+    going_on, from_free, total = itertools.accumulate(NUM_LATE)
+
     def goes_on(carry):
         turn, _, is_moving, _ = carry
-        return jnp.any(is_moving) & (turn < NUM_NEWTON + _NUM_DAMPED)
+        return jnp.any(is_moving) & (turn < NUM_NEWTON + total)
 
     def advance(carry):
         turn, last, is_moving, is_settled = carry
         is_limited = jnp.where(turn > 0, 1.0, 0.0).astype(problem.mass.dtype)
-        is_late = turn >= NUM_NEWTON
-        # What goes beyond rest does so no further than is good for it, so that nothing
-        # is taken to stick for that.
-        before = tuple(
-            jnp.where(is_late, now, old)
-            for now, old in zip(last.twist, last.before, strict=True)
+        late = turn - NUM_NEWTON
+        guess = last._replace(
+            # What slips beyond rest may do so, so that nothing is taken to stick.
+            before=jax.tree.map(
+                lambda now, old: jnp.where(late >= 0, now, old), last.twist, last.before
+            )
         )
-        guess = last._replace(before=before)
-        found = newton_step(problem, guess, is_limited).solution
-        is_near = ~_has_moved(guess.twist, found.twist, _UNSETTLED) | ~has_any
-        share = jax.lax.cond(is_late, _good_share, _whole, problem, guess, found)
-        share = share[None]
+        free = tuple(
+            problem.mobile * p / inertia
+            for p, inertia in zip(
+                problem.momentum,
+                (problem.mass, problem.mass, problem.inertia),
+                strict=True,
+            )
+        )
+        for begin, twist in ((going_on, free), (from_free, problem.start)):
+            guess = _from_elsewhere(guess, late == begin, twist)
+        found, is_whole = newton_step(problem, guess, is_limited)
+        is_near = ~_has_moved(guess.twist, found.twist, _UNSETTLED) & is_whole
+        share = jnp.where(late >= 0, shares[late % len(LATE_SHARES)], 1.0)
         twist, impulse = jax.tree.map(
-            lambda old, new, share=share: old + share * (new - old),
+            lambda old, new: old + share * (new - old),
             (guess.twist, guess.impulse),
             (found.twist, found.impulse),
         )
@@ -126,12 +129,12 @@ def _search(problem: VelocityProblem, start: tuple) -> tuple:
             for new, old in zip(twist, found.before, strict=True)
         )
         found = Solution(twist, (x, y, spin), impulse)
-        has_moved = (turn == 0) | _has_moved(guess.twist, found.twist)
+        has_moved = (turn == 0) | ~is_whole | _has_moved(guess.twist, found.twist)
         # Lanes that are done stay as they are, whatever the others do.
         found = jax.tree.map(
             lambda new, old: jnp.where(is_moving[None], new, old), found, last
         )
-        is_settled = jnp.where(is_moving, is_near, is_settled)
+        is_settled = jnp.where(is_moving, is_near | ~has_any, is_settled)
         # All have one iteration, which is all that lanes need that are not open.
         is_moving = is_moving & is_open & has_any & has_moved
         return turn + 1, found, is_moving, is_settled
@@ -143,73 +146,12 @@ def _search(problem: VelocityProblem, start: tuple) -> tuple:
     return (found.twist, found.impulse), (found.before, is_settled)
 
 
-def _whole(problem: VelocityProblem, guess: Solution, found: Solution) -> Array:
-    del problem, found
-    return jnp.ones_like(guess.twist[0][0])
-
-
-def _good_share(problem: VelocityProblem, guess: Solution, found: Solution) -> Array:
-    """Share of a Newton step after which nothing is left to gain along it.
-
-    Friction resists the more the faster it is sheared, so that what is lacking of the
-    momentum balance, taken along the step, changes sign once: at a minimum, where all
-    friction has a potential. Steps that end there cannot go round in circles.
-    """
-    step = tuple(v - u for u, v in zip(guess.twist, found.twist, strict=True))
-
-    def narrow(turn, ends):
-        low, high, at_low, at_high = ends
-        share = jnp.clip(_secant(*ends[2:]), 0.05, 0.95)
-        share = low + (high - low) * share
-        # Both ends come first.
-        share = jnp.where(turn == 0, 0.0, jnp.where(turn == 1, 1.0, share))
-        value = _lacking_along(problem, guess.twist, step, share[None])
-        is_low = (turn == 0) | ((turn != 1) & (value < 0.0))
-        return (
-            jnp.where(is_low, share, low),
-            jnp.where(is_low, high, share),
-            jnp.where(is_low, value, at_low),
-            jnp.where(is_low, at_high, value),
-        )
-
-    zero = jnp.zeros_like(step[0][0])
-    ends = (zero, zero + 1.0, zero, zero)
-    ends = jax.lax.fori_loop(0, _NUM_NARROWED, narrow, ends)
-    low, high, _, at_high = ends
-    share = low + (high - low) * jnp.clip(_secant(*ends[2:]), 0.0, 1.0)
-    return jnp.where(at_high <= 0.0, 1.0, share)
-
-
-def _secant(at_low, at_high) -> Array:
-    """Where between two ends a line through their values is zero; else half-way."""
-    gap = at_high - at_low
-    return jnp.where(gap > 0.0, -at_low / jnp.where(gap > 0.0, gap, 1.0), 0.5)
-
-
-def _lacking_along(problem: VelocityProblem, start: tuple, step: tuple, share) -> Array:
-    """What is lacking of the momentum balance after a part of a step, along the step.
-
-    What joints do does no work along it and is left out.
-    """
-    twist = tuple(u + share * d for u, d in zip(start, step, strict=True))
-    felt = Felt(problem.frame, problem.turn, problem.start, twist, twist)
-    friction = friction_of_bodies(problem.contacts, problem.spins, felt, 1.0)
-    inertia = (problem.mass, problem.mass, problem.inertia)
-    parts = [
-        d * (m * v - p)
-        for d, m, v, p in zip(step, inertia, twist, problem.momentum, strict=True)
-    ]
-    if friction is not None:
-        along = into_frame(problem.frame, step)
-        parts += [-d * f for d, f in zip(along, friction[1], strict=True)]
-    if problem.laws is not None:
-        laws = problem.laws
-        moving = speed(laws.rows, twist)
-        slope, offset = elementwise(
-            law_line, laws.friction, laws.start, laws.target, moving, moving, 1.0
-        )
-        parts.append(speed(laws.rows, step) * (slope * moving - offset))
-    return functools.reduce(jnp.add, [jnp.sum(part, axis=0) for part in parts])
+def _from_elsewhere(guess: Solution, is_now: Any, twist: tuple) -> Solution:
+    """A new start, with nothing known of impulses, where the time has come."""
+    impulse = None if guess.impulse is None else jnp.zeros_like(guess.impulse)
+    x, y, spin = twist
+    begun = Solution((x, y, spin), (x, y, spin), impulse)
+    return jax.tree.map(lambda new, old: jnp.where(is_now, new, old), begun, guess)
 
 
 def _has_any(problem: VelocityProblem) -> Bool[Array, " lane"]:

@@ -123,7 +123,8 @@ class Solved(NamedTuple):
 
     solution: Solution
     is_settled: Bool[Array, " lane"]
-    """Whether a last iteration changed next to nothing, as far as is known."""
+    """Whether a last iteration changed next to nothing, as far as is known; of a single
+    one, whether it took every contact as it is (`friction.limited`)."""
 
 
 def first_guess(problem: VelocityProblem) -> Solution:
@@ -152,13 +153,18 @@ def newton_step(
     """
     felt = Felt(problem.frame, problem.turn, problem.start, guess.twist, guess.before)
     friction = friction_of_bodies(problem.contacts, problem.spins, felt, is_limited)
-    unknown, zero = jnp.ones(problem.mass.shape[-1], bool), jnp.zeros_like(problem.mass)
+    is_whole, zero = (
+        jnp.ones(problem.mass.shape[-1], bool),
+        jnp.zeros_like(problem.mass),
+    )
+    if friction is not None:
+        is_whole = is_whole & (jnp.sum(friction[2], axis=0) == 0.0)
     given = (zero, zero, zero)
     push, end = problem.push, problem.end
     if push is None or end is None or guess.impulse is None:
         _, free = answer_of_bodies(problem, friction, guess.twist, given)
-        return Solved(Solution(free, guess.twist, None), unknown)
-    gain, diagonal, demand, is_needed = _system(problem, guess, is_limited)
+        return Solved(Solution(free, guess.twist, None), is_whole)
+    gain, diagonal, demand, is_needed, num_back = _system(problem, guess, is_limited)
     given = pushed(given, push, guess.impulse)
     answer, free = answer_of_bodies(problem, friction, guess.twist, given)
     one = runtime_one(problem.mass)
@@ -170,12 +176,17 @@ def newton_step(
     twist = moved_by(free, push, columns, change)
     x, y, spin = (hold(v, one) for v in twist)
     impulse = guess.impulse + change
-    return Solved(Solution((x, y, spin), guess.twist, impulse), unknown)
+    is_whole = is_whole & (num_back == 0.0)
+    return Solved(Solution((x, y, spin), guess.twist, impulse), is_whole)
 
 
 def _system(problem: VelocityProblem, guess: Solution, is_limited) -> tuple:
-    """Of the rows, with g J_e w + d lambda = r: g, d, r, and which are needed."""
+    """Of the rows, with g J_e w + d lambda = r: g, d, r, and which are needed.
+
+    And of each lane, how many frictions are taken as sticking.
+    """
     gain, diagonal, demand, needs = [], [], [], []
+    num_back: Any = 0.0
     if problem.ease is not None:
         ease = problem.ease
         gain.append(jnp.ones_like(ease))
@@ -185,9 +196,10 @@ def _system(problem: VelocityProblem, guess: Solution, is_limited) -> tuple:
     if problem.laws is not None:
         laws = problem.laws
         seen = speed(laws.rows, guess.twist), speed(laws.rows, guess.before)
-        slope, offset = elementwise(
+        slope, offset, back = elementwise(
             law_line, laws.friction, laws.start, laws.target, *seen, is_limited
         )
+        num_back = jnp.sum(back, axis=0)
         gain.append(slope)
         diagonal.append(jnp.ones_like(slope))
         demand.append(offset)
@@ -202,19 +214,23 @@ def _system(problem: VelocityProblem, guess: Solution, is_limited) -> tuple:
         for whole, part in zip((gain, diagonal, demand), parts, strict=True):
             whole.append(part)
         needs.append(parts[0] > 0.0)
-    return tuple(jnp.concatenate(parts) for parts in (gain, diagonal, demand, needs))
+    rows = (jnp.concatenate(parts) for parts in (gain, diagonal, demand, needs))
+    return *rows, num_back
 
 
 def law_line(spin: Spin, start, target, now, before, is_limited) -> tuple:
-    """Slope of a friction and its demand: lambda + slope J w = demand; in scalars."""
+    """Slope of a friction and its demand: lambda + slope J w = demand; in scalars.
+
+    And one where it is taken as sticking (`friction.limited`), else zero.
+    """
 
     def blend(value):
         return spin.weight * value + (1.0 - spin.weight) * start - target
 
     knee, u = spin.knee * is_limited, blend(now)
-    scale, ((k,),) = limited((u,), (spin.viscous,), (knee,), (blend(before),))
+    scale, ((k,),), back = limited((u,), (spin.viscous,), (knee,), (blend(before),))
     slope = k * spin.weight
-    return slope, slope * now - scale * spin.viscous * u
+    return slope, slope * now - scale * spin.viscous * u, back
 
 
 def _limit(least, most, ease, now, pressure) -> tuple:

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import boomdp_jax.physics.prepare as preparation
 from boomdp_jax.physics import Params, State, empty_params, rollout, step
+from tests.physics.retraced import OnGeneralPath
 from tests.physics.scenes import make_scene
 from tests.reference.planar_dynamics import World
 
@@ -93,19 +93,11 @@ def many_steps(params, state, wrench, dt):
     return rollout(SCENE, params, state, wrenches, dt=dt)[0].array
 
 
-def on_general_path(function, *arguments):
-    """Call a compiled function whose first call, its trace, avoids the fast path."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(preparation, "MOST_LONE_CONTACTS", -1)
-        return function(*arguments)
-
-
 @pytest.fixture(scope="module")
 def paths():
     """Both paths, each compiled once."""
-    fast = jax.jit(jax.vmap(many_steps, in_axes=(0, 0, 0, None)))
-    general = jax.jit(jax.vmap(lambda *each: many_steps(*each), (0, 0, 0, None)))
-    return fast, lambda *each: on_general_path(general, *each)
+    many = jax.vmap(many_steps, in_axes=(0, 0, 0, None))
+    return jax.jit(many), OnGeneralPath(many)
 
 
 @pytest.mark.slow
