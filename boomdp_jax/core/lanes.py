@@ -236,7 +236,7 @@ def _in_blocks(*arguments, program, block):
     """Block after block, each of the same length."""
     lanes = arguments[0].shape[-1]
     num = -(-lanes // block)
-    if num == 1:
+    if num <= 1:
         return program(*arguments)
     length = -(-lanes // num)
     spare = num * length - lanes

@@ -34,8 +34,8 @@ LATE_SHARES = (1.0, 1.0, 0.5)
 """Shares of the iterations after these, over and over, from where the others ended.
 Tracks go round between kinks, where one wheel starts to slip and another holds; a step
 a little shorter leads out of that. (Lengths of steps chosen by what is left to solve
-serve less well. Limits that are ellipses make the force no gradient of anything, and
-what is left has minima of its own: a third of such tracks were held up there.)"""
+serve such less well. Limits that are ellipses make the force no gradient of anything,
+and what is left has minima of its own: a third of these tracks were held up there.)"""
 
 NUM_LATE = (15, 12, 12)
 """How many of them: going on, then from the solution without friction, then from the

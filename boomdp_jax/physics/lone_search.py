@@ -30,10 +30,10 @@ from boomdp_jax.physics.lone_friction import (
 # An iteration that changes a motion by less than this power of the rounding unit (of
 # what it is) was the last: Newton's method squares what is left to correct.
 _SETTLED = 0.7
-# Taken out of a batch at once.
-_AT_A_TIME = 16
-# In a batch of no more than so many times that nothing is taken out.
-_FEW = 8
+# Taken out of a batch at once: at least so many, and one in so many.
+_AT_A_TIME, _ONE_IN = 16, 64
+# From a batch of no more than so many nothing is taken out.
+_FEW = 128
 
 
 class Rubbing(NamedTuple):
@@ -85,7 +85,7 @@ def search_friction(problem_of: Callable[..., Rubbing], *given: Any) -> Triple:
 
     def rest(search: Search) -> Search:
         whole = given, search
-        # One block: whatever its size, few of it are left.
+        # One block: whatever its size, most of the time few of it are left.
         return in_lanes(_rest, *whole, static=static, block=2**30)
 
     search = jax.lax.cond(is_any_open, rest, lambda search: search, search)
@@ -146,24 +146,32 @@ def _iterated(rubbing: Rubbing, e: Triple, before: Triple | None, share) -> Sear
 def _rest(problem_of: Callable[..., Rubbing], given: tuple, search: Search) -> Search:
     """What is left of a batch `[lane]`, a few lanes at a time."""
     num = search.is_open.shape[-1]
-    if num <= _FEW * _AT_A_TIME:
+    if num <= _FEW:
         return _to_the_end(problem_of, given, search)
+    at_a_time = max(_AT_A_TIME, num // _ONE_IN)
+    is_open = search.is_open > 0
+    count = jnp.cumsum(is_open.astype(jnp.int32))
+    # Open lanes in order, then a number that is none's.
+    place = jnp.where(is_open, count - 1, num + at_a_time)
+    order = jnp.full(num + at_a_time, num, jnp.int32)
+    order = order.at[place].set(jnp.arange(num, dtype=jnp.int32), mode="drop")
 
-    def go_on(search: Search) -> Search:
-        is_open, lanes = jax.lax.top_k(search.is_open, _AT_A_TIME)
-        lanes = jnp.where(is_open > 0, lanes, num)
+    def go_on(carry: tuple) -> tuple:
+        begin, search = carry
+        lanes = jax.lax.dynamic_slice(order, (begin,), (at_a_time,))
 
         def taken(leaf: Array) -> Array:
             # Where there are fewer, the last lane stands in, and is not put back.
             return leaf.at[lanes].get(mode="clip")
 
-        own, few = jax.tree.map(taken, (given, search))
-        few = _to_the_end(problem_of, own, few)
-        return jax.tree.map(
+        few = _to_the_end(problem_of, *jax.tree.map(taken, (given, search)))
+        search = jax.tree.map(
             lambda leaf, part: leaf.at[lanes].set(part, mode="drop"), search, few
         )
+        return begin + at_a_time, search
 
-    return jax.lax.while_loop(_is_any_open, go_on, search)
+    start = jnp.zeros((), jnp.int32), search
+    return jax.lax.while_loop(lambda carry: carry[0] < count[-1], go_on, start)[1]
 
 
 def _to_the_end(

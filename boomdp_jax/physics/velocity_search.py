@@ -2,7 +2,9 @@ r"""Newton's method for the implicit velocity update, until it comes to rest.
 
 It starts from the solution in which everything sticks: from there a contact that slips
 is left on its own side, and one that sticks is already solved. After `NUM_NEWTON`
-iterations few are left, which go on by `LATE_SHARES` of them, `NUM_LATE` times.
+iterations few are left. In further ones each step ends where nothing is left to gain
+along it, which solves what has a potential, joints with friction and motors among it.
+What is left then goes on by `LATE_SHARES` of steps, `NUM_LATE` times.
 
 Derivatives are those of one more iteration with what it starts from held constant
 (`core.searched`).
@@ -18,17 +20,24 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from boomdp_jax.core.one_loop import elementwise
 from boomdp_jax.core.searched import searched
+from boomdp_jax.physics.body_friction import Felt, friction_of_bodies, into_frame
 from boomdp_jax.physics.friction import LATE_SHARES, NUM_LATE, NUM_NEWTON
+from boomdp_jax.physics.row_algebra import speed
 from boomdp_jax.physics.velocity_solve import (
     Solution,
     Solved,
     VelocityProblem,
     first_guess,
+    law_line,
     newton_step,
 )
 
-# Relative change in the last iteration from which it has not.
+# Iterations, after `NUM_NEWTON`, that end where nothing is left to gain along them, and
+# evaluations with which that end is found.
+_NUM_LINES, _NUM_NARROWED = 12, 5
+# Relative change in the last iteration from which a lane counts as not settled.
 _UNSETTLED = 1e-3
 
 
@@ -93,16 +102,17 @@ def _search(problem: VelocityProblem, start: tuple) -> tuple:
 
     def goes_on(carry):
         turn, _, is_moving, _ = carry
-        return jnp.any(is_moving) & (turn < NUM_NEWTON + total)
+        return jnp.any(is_moving) & (turn < NUM_NEWTON + _NUM_LINES + total)
 
     def advance(carry):
         turn, last, is_moving, is_settled = carry
         is_limited = jnp.where(turn > 0, 1.0, 0.0).astype(problem.mass.dtype)
-        late = turn - NUM_NEWTON
+        is_line = turn >= NUM_NEWTON
+        late = turn - NUM_NEWTON - _NUM_LINES
         guess = last._replace(
             # What slips beyond rest may do so, so that nothing is taken to stick.
             before=jax.tree.map(
-                lambda now, old: jnp.where(late >= 0, now, old), last.twist, last.before
+                lambda now, old: jnp.where(is_line, now, old), last.twist, last.before
             )
         )
         free = tuple(
@@ -117,7 +127,12 @@ def _search(problem: VelocityProblem, start: tuple) -> tuple:
             guess = _from_elsewhere(guess, late == begin, twist)
         found, is_whole = newton_step(problem, guess, is_limited)
         is_near = ~_has_moved(guess.twist, found.twist, _UNSETTLED) & is_whole
-        share = jnp.where(late >= 0, shares[late % len(LATE_SHARES)], 1.0)
+        has_moved = (turn == 0) | ~is_whole | _has_moved(guess.twist, found.twist)
+        share = jax.lax.cond(
+            is_line & (late < 0), _good_share, _whole, problem, guess, found
+        )
+        late_share = shares[late % len(LATE_SHARES)]
+        share = jnp.where(late >= 0, late_share, share)[None]
         twist, impulse = jax.tree.map(
             lambda old, new: old + share * (new - old),
             (guess.twist, guess.impulse),
@@ -129,7 +144,6 @@ def _search(problem: VelocityProblem, start: tuple) -> tuple:
             for new, old in zip(twist, found.before, strict=True)
         )
         found = Solution(twist, (x, y, spin), impulse)
-        has_moved = (turn == 0) | ~is_whole | _has_moved(guess.twist, found.twist)
         # Lanes that are done stay as they are, whatever the others do.
         found = jax.tree.map(
             lambda new, old: jnp.where(is_moving[None], new, old), found, last
@@ -144,6 +158,75 @@ def _search(problem: VelocityProblem, start: tuple) -> tuple:
         goes_on, advance, (turn, guess, every, every)
     )
     return (found.twist, found.impulse), (found.before, is_settled)
+
+
+def _whole(problem: VelocityProblem, guess: Solution, found: Solution) -> Array:
+    del problem, found
+    return jnp.ones_like(guess.twist[0][0])
+
+
+def _good_share(problem: VelocityProblem, guess: Solution, found: Solution) -> Array:
+    """Share of a Newton step after which nothing is left to gain along it.
+
+    Friction resists the more the faster it is sheared, so that what is lacking of the
+    momentum balance, taken along the step, changes sign once: at a minimum, where all
+    friction has a potential. Steps that end there cannot go round in circles.
+    """
+    step = tuple(v - u for u, v in zip(guess.twist, found.twist, strict=True))
+
+    def narrow(turn, ends):
+        low, high, at_low, at_high = ends
+        share = jnp.clip(_secant(*ends[2:]), 0.05, 0.95)
+        share = low + (high - low) * share
+        # Both ends come first.
+        share = jnp.where(turn == 0, 0.0, jnp.where(turn == 1, 1.0, share))
+        value = _lacking_along(problem, guess.twist, step, share[None])
+        is_low = (turn == 0) | ((turn != 1) & (value < 0.0))
+        return (
+            jnp.where(is_low, share, low),
+            jnp.where(is_low, high, share),
+            jnp.where(is_low, value, at_low),
+            jnp.where(is_low, at_high, value),
+        )
+
+    zero = jnp.zeros_like(step[0][0])
+    ends = (zero, zero + 1.0, zero, zero)
+    ends = jax.lax.fori_loop(0, _NUM_NARROWED, narrow, ends)
+    low, high, _, at_high = ends
+    share = low + (high - low) * jnp.clip(_secant(*ends[2:]), 0.0, 1.0)
+    return jnp.where(at_high <= 0.0, 1.0, share)
+
+
+def _secant(at_low, at_high) -> Array:
+    """Where between two ends a line through their values is zero; else half-way."""
+    gap = at_high - at_low
+    return jnp.where(gap > 0.0, -at_low / jnp.where(gap > 0.0, gap, 1.0), 0.5)
+
+
+def _lacking_along(problem: VelocityProblem, start: tuple, step: tuple, share) -> Array:
+    """What is lacking of the momentum balance after a part of a step, along the step.
+
+    What joints do does no work along it and is left out.
+    """
+    twist = tuple(u + share * d for u, d in zip(start, step, strict=True))
+    felt = Felt(problem.frame, problem.turn, problem.start, twist, twist)
+    friction = friction_of_bodies(problem.contacts, problem.spins, felt, 1.0)
+    inertia = (problem.mass, problem.mass, problem.inertia)
+    parts = [
+        d * (m * v - p)
+        for d, m, v, p in zip(step, inertia, twist, problem.momentum, strict=True)
+    ]
+    if friction is not None:
+        along = into_frame(problem.frame, step)
+        parts += [-d * f for d, f in zip(along, friction[1], strict=True)]
+    if problem.laws is not None:
+        laws = problem.laws
+        moving = speed(laws.rows, twist)
+        slope, offset, _ = elementwise(
+            law_line, laws.friction, laws.start, laws.target, moving, moving, 1.0
+        )
+        parts.append(speed(laws.rows, step) * (slope * moving - offset))
+    return functools.reduce(jnp.add, [jnp.sum(part, axis=0) for part in parts])
 
 
 def _from_elsewhere(guess: Solution, is_now: Any, twist: tuple) -> Solution:

@@ -124,7 +124,7 @@ class Solved(NamedTuple):
     solution: Solution
     is_settled: Bool[Array, " lane"]
     """Whether a last iteration changed next to nothing, as far as is known; of a single
-    one, whether it took every contact as it is (`friction.limited`)."""
+    one see `newton_step`."""
 
 
 def first_guess(problem: VelocityProblem) -> Solution:
@@ -149,7 +149,8 @@ def newton_step(
         is_limited: one, or zero to leave out the dry limits, so that everything sticks.
 
     Returns:
-        Twists and impulses of the system linearised there.
+        Twists and impulses of the system linearised there; settled where no contact was
+        taken as sticking for that.
     """
     felt = Felt(problem.frame, problem.turn, problem.start, guess.twist, guess.before)
     friction = friction_of_bodies(problem.contacts, problem.spins, felt, is_limited)

@@ -7,14 +7,16 @@ from typing import Any
 import jax
 import pytest
 
+from boomdp_jax.core import lanes, one_loop
+
 _Patch = tuple[str, str, Any]
 
 
 class Retraced:
     """A function that is compiled while names of modules have other values.
 
-    Whatever was traced before is forgotten first: JAX keeps traces of parts, which do
-    not know that anything has changed.
+    Whatever was traced before is forgotten first: JAX keeps traces of parts, and so
+    does the package, which do not know that anything has changed.
     """
 
     def __init__(self, function: Callable, *patches: _Patch):
@@ -36,15 +38,23 @@ class Retraced:
         return self._programs[key](*arguments)
 
     def _compiled(self, arguments: tuple) -> Callable:
-        jax.clear_caches()
+        _forget()
         with pytest.MonkeyPatch.context() as patch:
             for module, name, value in self._patches:
                 # By its name a module may be a function of the same name.
                 module = importlib.import_module(f"boomdp_jax.{module}")
                 patch.setattr(module, name, value)
             program = jax.jit(self._function).lower(*arguments).compile()
-        jax.clear_caches()
+        _forget()
         return program
+
+
+def _forget() -> None:
+    jax.clear_caches()
+    for module in (lanes, one_loop):
+        for value in vars(module).values():
+            if hasattr(value, "cache_clear"):
+                value.cache_clear()
 
 
 class OnGeneralPath(Retraced):

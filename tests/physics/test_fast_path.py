@@ -139,7 +139,7 @@ def worst_of_each(array, expected):
 @pytest.mark.slow
 @pytest.mark.parametrize("has_nuisances", [True, False], ids=["full", "plain"])
 def test_fast_path_agrees_with_the_general_one(has_nuisances):
-    patient = OnGeneralPath(step_of_length, NUM_LATE=(15, 12, 300))
+    patient = OnGeneralPath(step_of_length, NUM_LATE=(60, 60, 300), _NUM_LINES=60)
     for spread in (1.0, 4.0):
         cases = draws(spread, has_nuisances=has_nuisances)
         for dt, function in ((SHORT, fast_short_step), (float(SCENE.dt), fast_step)):
