@@ -140,10 +140,8 @@ def track_sums(track: Track, motions: Motions) -> Sums:
         if old is not None:
             past = (k * old[0][i], m * old[1])
             is_back = is_reversed(ratio, past)
-            square, back = (
-                jnp.where(is_back, 1.0, square),
-                jnp.where(is_back, 1.0, back),
-            )
+            square = jnp.where(is_back, 1.0, square)
+            back = jnp.where(is_back, 1.0, back)
         scale = slip_scale(square)
         loss = jnp.where(scale < 1.0, scale * scale, 0.0)
         cs, ds = scale * c, scale * d
@@ -181,10 +179,8 @@ def feet_sums(feet: Feet, motions: Motions) -> Sums:
         if old is not None:
             past = (knee * (old[0] + p * old[2]), knee * (old[1] + q * old[2]))
             is_back = is_reversed((knee * u, knee * v), past)
-            square, back = (
-                jnp.where(is_back, 1.0, square),
-                jnp.where(is_back, 1.0, back),
-            )
+            square = jnp.where(is_back, 1.0, square)
+            back = jnp.where(is_back, 1.0, back)
         scale = slip_scale(square)
         c, ratio = scale * c, knee * scale
         loss = jnp.where(scale < 1.0, c * ratio * ratio, 0.0)

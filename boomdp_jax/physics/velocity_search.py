@@ -99,6 +99,9 @@ def _search(problem: VelocityProblem, start: tuple) -> tuple:
 
     shares = jnp.asarray(LATE_SHARES, problem.mass.dtype)
     going_on, from_free, total = itertools.accumulate(NUM_LATE)
+    x, y, spin = problem.momentum
+    light = problem.mobile / problem.mass
+    free = (light * x, light * y, problem.mobile / problem.inertia * spin)
 
     def goes_on(carry):
         turn, _, is_moving, _ = carry
@@ -107,20 +110,13 @@ def _search(problem: VelocityProblem, start: tuple) -> tuple:
     def advance(carry):
         turn, last, is_moving, is_settled = carry
         is_limited = jnp.where(turn > 0, 1.0, 0.0).astype(problem.mass.dtype)
-        is_line = turn >= NUM_NEWTON
+        is_early = turn < NUM_NEWTON
         late = turn - NUM_NEWTON - _NUM_LINES
+        is_line = ~is_early & (late < 0)
         guess = last._replace(
             # What slips beyond rest may do so, so that nothing is taken to stick.
             before=jax.tree.map(
-                lambda now, old: jnp.where(is_line, now, old), last.twist, last.before
-            )
-        )
-        free = tuple(
-            problem.mobile * p / inertia
-            for p, inertia in zip(
-                problem.momentum,
-                (problem.mass, problem.mass, problem.inertia),
-                strict=True,
+                lambda now, old: jnp.where(is_early, old, now), last.twist, last.before
             )
         )
         for begin, twist in ((going_on, free), (from_free, problem.start)):
@@ -128,9 +124,7 @@ def _search(problem: VelocityProblem, start: tuple) -> tuple:
         found, is_whole = newton_step(problem, guess, is_limited)
         is_near = ~_has_moved(guess.twist, found.twist, _UNSETTLED) & is_whole
         has_moved = (turn == 0) | ~is_whole | _has_moved(guess.twist, found.twist)
-        share = jax.lax.cond(
-            is_line & (late < 0), _good_share, _whole, problem, guess, found
-        )
+        share = jax.lax.cond(is_line, _good_share, _whole, problem, guess, found)
         late_share = shares[late % len(LATE_SHARES)]
         share = jnp.where(late >= 0, late_share, share)[None]
         twist, impulse = jax.tree.map(

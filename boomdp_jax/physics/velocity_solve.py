@@ -154,10 +154,8 @@ def newton_step(
     """
     felt = Felt(problem.frame, problem.turn, problem.start, guess.twist, guess.before)
     friction = friction_of_bodies(problem.contacts, problem.spins, felt, is_limited)
-    is_whole, zero = (
-        jnp.ones(problem.mass.shape[-1], bool),
-        jnp.zeros_like(problem.mass),
-    )
+    zero = jnp.zeros_like(problem.mass)
+    is_whole = jnp.ones(problem.mass.shape[-1], bool)
     if friction is not None:
         is_whole = is_whole & (jnp.sum(friction[2], axis=0) == 0.0)
     given = (zero, zero, zero)

@@ -38,10 +38,8 @@ def draw(key, has_ground: bool) -> tuple[Params, State, jax.Array]:
 
     lateral = MASS * jnp.exp(normal(jnp.log(60.0), 1.2))
     limit = WEIGHT * jnp.exp(normal(jnp.log(0.5), 0.7))
-    rolling, dry = (
-        jax.nn.sigmoid(normal(-2.5, 1.25)),
-        jax.nn.sigmoid(normal(-2.5, 1.25)),
-    )
+    rolling = jax.nn.sigmoid(normal(-2.5, 1.25))
+    dry = jax.nn.sigmoid(normal(-2.5, 1.25))
     wheel = Wheel(
         active=jnp.ones((1, 1), bool),
         position=(HALF_EXTENTS * normal(0.0, 0.7, 2))[None, None],
