@@ -163,6 +163,9 @@ def counted_calls() -> Iterator[list[int]]:
         """Of one call; see what the first stages of these programs take."""
         if program is filter_points._FILTERS:
             return len(arguments[0])
+        if program is filter_points._DENSITIES:
+            structure, *_ = arguments[3]
+            return int(arguments[2]) * structure.shape[1]
         place = 4 if program is evaluate._PUSHED else 2
         return int(arguments[place]) * CHUNK_SIZE
 

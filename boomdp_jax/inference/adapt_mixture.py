@@ -28,15 +28,18 @@ from boomdp_jax.inference.walker_moves import (
     no_moves,
     propose_all,
 )
-from boomdp_jax.inference.weighing import refine, weigh
+from boomdp_jax.inference.weighing import evaluate_asked, refine, taken_over, weigh
 
-# Rounds end where every structure of such a probability has this many effective draws.
-_MATTERS, _ENOUGH = 0.01, 300.0
+# Rounds end where every structure of such a probability has this many effective draws,
+# and from the last number of rounds on where they are no more than so many times what
+# they were.
+_MATTERS, _ENOUGH, _GROWTH, _FEW_ROUNDS = 0.01, 300.0, 1.5, 3
 _NUM_WALKERS, _NUM_WALKS = 512, 6
+# The first few steps of a round take walkers apart; a component is fitted to the rest.
+_NUM_PASSED_OVER = 2
 # A structure gets walkers if its probability is above this; half of them are spread
 # evenly over all that do.
 _LEAST_PROBABILITY, _EVEN_SHARE = 1e-8, 0.5
-_WALK_STEP, _WALK_ACCEPT = 0.5, 0.4
 
 
 class Adapted(NamedTuple):
@@ -47,10 +50,13 @@ class Adapted(NamedTuple):
 
 
 class Walked(NamedTuple):
-    """Where walkers ended, and how their moves went."""
+    """Where walkers ended and came by, and how their moves went."""
 
     points: Point
     counts: MoveCounts
+    places: tuple[np.ndarray, np.ndarray]
+    """Structures `[object, place]` and coordinates `[object, place, dim]` after each
+    step but the first few."""
 
 
 def adapt_mixtures(
@@ -70,7 +76,8 @@ def adapt_mixtures(
         mixtures: one of each object, with spare components.
         num_draws: of each round and object.
         evaluate: log-densities of as many points of every object.
-        max_rounds: rounds of walks, at least 1; fewer where draws are enough.
+        max_rounds: rounds of walks, at least 1; fewer where draws are enough, or where
+            there come to be no more of them.
 
     Returns:
         Mixtures with other weights and, where walkers were enough, with a component
@@ -80,14 +87,23 @@ def adapt_mixtures(
     found = weigh(rng, targets, mixtures, num_draws, evaluate)
     mixtures = refine(targets, mixtures, found)
     points = _walkers(rng, found, targets, mixtures)
-    for _ in range(max_rounds):
-        points = walk(rng, points, targets, mixtures, evaluate, _NUM_WALKS).points
-        places = np.asarray(points.structure), np.asarray(points.z)
-        mixtures = fit_spare(targets, mixtures, *places)
-        found = weigh(rng, targets, mixtures, num_draws, evaluate)
-        mixtures = refine(targets, mixtures, found)
-        if _is_enough(found):
+    is_open = np.ones(targets.structures.shape[0], bool)
+    most = np.zeros(targets.structures.shape[0])
+    for number in range(max_rounds):
+        walked = walk(rng, points, targets, mixtures, evaluate, _NUM_WALKS * is_open)
+        points = walked.points
+        fitted = fit_spare(targets, mixtures, *walked.places)
+        again = weigh(rng, targets, fitted, num_draws, evaluate, is_open)
+        fitted = refine(targets, fitted, again)
+        mixtures = taken_over(is_open, fitted, mixtures)
+        found = taken_over(is_open, again, found)
+        size = _least_size(found)
+        is_open = is_open & (size < _ENOUGH)
+        if number + 1 >= _FEW_ROUNDS:
+            is_open = is_open & (size > _GROWTH * most)
+        if not np.any(is_open):
             break
+        most = np.maximum(most, size)
     return Adapted(mixtures, found)
 
 
@@ -97,7 +113,7 @@ def walk(
     targets: StructureTarget,
     mixtures: LaplaceMixture,
     evaluate: Callable[..., Array],
-    num_walks: int,
+    num_walks: np.ndarray,
 ) -> Walked:
     """Some steps of every walker within its structure.
 
@@ -107,26 +123,32 @@ def walk(
         targets: stacked along a leading object axis.
         mixtures: one of each object.
         evaluate: log-densities of as many points of every object.
-        num_walks: steps; their size adapts to the acceptance of the one before.
+        num_walks: steps of the walkers of each object, `[object]`.
     """
     log_proposal = log_proposal_of(targets, mixtures, points.structure, points.z)
     points = eqx.tree_at(lambda p: p.log_proposal, points, log_proposal)
-    num_objects = targets.structures.shape[0]
-    counts, step_size = no_moves(num_objects), np.full(num_objects, _WALK_STEP)
-    for _ in range(num_walks):
-        batch = propose_all("walk", rng, points, targets, mixtures, step_size)
+    counts = no_moves(targets.structures.shape[0])
+    places = []
+    for number in range(num_walks.max()):
+        is_asked = number < num_walks
+        batch = propose_all("walk", rng, points, targets, mixtures)
         where = batch.proposal.structure, batch.proposal.z
-        points, info = decide_all(rng, points, batch, evaluate(targets, *where))
-        count_moves(counts, "walk", info)
-        rate = np.mean(np.asarray(info.accept_probability, float), axis=1)
-        step_size = np.clip(step_size * np.exp(rate - _WALK_ACCEPT), 0.02, 0.98)
-    return Walked(points, counts)
+        log_density = evaluate_asked(evaluate, targets, *where, is_asked)
+        points, info = decide_all(rng, points, batch, log_density)
+        count_moves(counts, "walk", info, is_asked)
+        if number >= _NUM_PASSED_OVER or number + 1 == num_walks.max():
+            places.append((np.asarray(points.structure), np.asarray(points.z)))
+    structures, z = (
+        np.concatenate(parts, axis=1) for parts in zip(*places, strict=True)
+    )
+    return Walked(points, counts, (structures, z))
 
 
-def _is_enough(evidence: ImportanceEvidence) -> bool:
-    """Whether every structure that matters has draws enough, for every object."""
+def _least_size(evidence: ImportanceEvidence) -> np.ndarray:
+    """Effective draws of the structure that has fewest of those that matter."""
+    matters = np.asarray(evidence.probability) > _MATTERS
     size = np.asarray(evidence.structure_sample_size)
-    return not np.any(size[np.asarray(evidence.probability) > _MATTERS] < _ENOUGH)
+    return np.min(np.where(matters, size, np.inf), axis=1)
 
 
 def _walkers(

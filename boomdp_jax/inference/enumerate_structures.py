@@ -75,9 +75,9 @@ def enumerate_structures(
         found, targets, mixtures, settings.num_chains, settings.num_samples
     )
     # Few effective draws are repeated often, and have to walk apart.
-    least_size = float(np.asarray(found.effective_sample_size).min())
-    num_walks = _NUM_WALKS[int(least_size < _GOOD_SHARE * size)]
-    points, counts = walk(rng, points, targets, mixtures, evaluate, num_walks)
+    is_poor = np.asarray(found.effective_sample_size) < _GOOD_SHARE * size
+    num_walks = np.where(is_poor, *_NUM_WALKS[::-1])
+    points, counts, _ = walk(rng, points, targets, mixtures, evaluate, num_walks)
     bridged = bridge_structures(targets, mixtures, found, points, settings.num_chains)
     draws = _in_chains(rng, points, bridged.evidence.probability, settings.num_chains)
     verdicts = []

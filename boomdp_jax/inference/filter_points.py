@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from boomdp_jax.core.spread import Program, num_at_a_time, run_each
-from boomdp_jax.inference.chunking import Chunking, for_each_chunk
+from boomdp_jax.inference.chunking import CHUNK_SIZE, Chunking, for_each_chunk
 from boomdp_jax.inference.filter_density import filter_density
 from boomdp_jax.inference.kalman import Filtered, NoiseLevel, extended_filter
 from boomdp_jax.inference.noise_level import NoiseFit
@@ -15,6 +15,8 @@ from boomdp_jax.inference.target import StructureTarget
 
 # Points filtered by one call of the program that makes gains.
 _POINTS_PER_CALL = 8
+# Bodies by whose number points of a chunk are divided, at most.
+_MOST_DIVIDED = 4
 
 
 def _gather_chunks(targets: StructureTarget, owners, owner, num, points) -> tuple:
@@ -65,8 +67,10 @@ def filter_densities(
     Returns:
         `[point]`, minus infinity where the filter's result is not finite.
     """
-    # Nothing here belongs to a structure as gains do: chunks are of one object.
-    chunks = Chunking.of(index, np.zeros_like(structure), 1)
+    # Nothing here belongs to a structure as gains do: chunks are of one object. Of each
+    # point its neighbours are stepped as well, of a pair thirteen states.
+    size = CHUNK_SIZE // min(noise.reading.shape[1], _MOST_DIVIDED)
+    chunks = Chunking.of(index, np.zeros_like(structure), 1, size=size)
     dtype = targets.log_prior.dtype
     dealt = list(chunks.calls(num_at_a_time()))
     inputs = [

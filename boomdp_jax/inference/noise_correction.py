@@ -15,6 +15,9 @@ effective sample size of its weights at a given share, resamples, and moves coor
 and noise of every draw by Metropolis steps within its structure (Del Moral, Doucet and
 Jasra 2006, Sequential Monte Carlo samplers). Where the fixed gains were right that is
 one step. Structures change their probability by the mean weight of their draws.
+
+Where few lineages are left, their draws are moved on until they are worth enough
+independent ones (`lineages`).
 """
 
 from typing import NamedTuple
@@ -23,9 +26,10 @@ import numpy as np
 
 from boomdp_jax.inference.fit import Fits
 from boomdp_jax.inference.fit_noise import NoiseDensity
+from boomdp_jax.inference.lineages import worth_of_draws
 from boomdp_jax.inference.noise_level import NoiseFit
+from boomdp_jax.inference.noise_moves import MoveKinds
 from boomdp_jax.inference.noise_problem import (
-    KINDS,
     NoiseDraws,
     NoiseProblem,
     effective_size,
@@ -41,11 +45,9 @@ _MAX_STEPS = 20
 _MOVES_BETWEEN, _LAST_MOVES = 1, 2
 # Where the first weights count for this share of the draws one move will do.
 _GOOD_SHARE = 0.5
-# Lineages below which draws are moved on, at most so often, until they are less like
-# what they were than this; and likeness beyond which a result is doubted.
-_FEW_LINEAGES, _MOST_MOVES, _MOST_ALIKE, _TOO_ALIKE = 50.0, 24, 0.5, 0.8
-# Share of an object's draws that a structure has to have for that to count.
-_COUNTED_SHARE = 0.05
+# Independent draws that those of an object are to be worth: they are moved on until
+# they are, at most so often. What is worth less than the last number is doubted.
+_ENOUGH, _MOST_MOVES, _TOO_FEW = 100.0, 24, 30.0
 # Distinct draws that are left of all, below which a result is doubted.
 _LEAST_LEFT = 0.02
 
@@ -98,6 +100,7 @@ def infer_noise(
     log_share = np.zeros((num_objects, num_chains))
     before = draws.structure
     first_size = np.zeros(num_objects)
+    kinds = MoveKinds(problem.num_groups)
     while np.any(power < 1.0) and steps < _MAX_STEPS:
         ratio = draws.ratio.reshape(num_objects, -1)
         step = np.array(
@@ -110,16 +113,17 @@ def infer_noise(
             first_size = np.array([effective_size(each) for each in ratio])
         log_weight = times(step[:, None], ratio).reshape(num_objects, num_chains, -1)
         log_share += np.logaddexp.reduce(log_weight, axis=-1) - np.log(num_each)
+        is_under_way = power < 1.0
         power = np.where(step >= 1.0 - power, 1.0, power + step)
-        draws = draws.take(_resample(rng, log_weight))
+        draws = draws.take(_resample(rng, log_weight, is_under_way))
         steps += 1
-        is_last = np.all(power >= 1.0)
-        is_easy = steps == 1 and np.all(first_size > _GOOD_SHARE * structure[0].size)
-        num_moves = _LAST_MOVES if is_last and not is_easy else _MOVES_BETWEEN
-        for number in range(num_moves):
-            kind = KINDS[(steps + number) % len(KINDS)]
-            draws = problem.move(rng, draws, power, kind)
-    draws, likeness = _spread(rng, problem, draws, index, power)
+        is_easy = (steps == 1) & (first_size > _GOOD_SHARE * structure[0].size)
+        num_moves = np.where((power >= 1.0) & ~is_easy, _LAST_MOVES, _MOVES_BETWEEN)
+        num_moves = np.where(is_under_way, num_moves, 0)
+        for number in range(num_moves.max()):
+            rows = np.flatnonzero((number < num_moves)[index])
+            draws = _moved(rng, problem, draws, rows, power, kinds)
+    draws, worth = _spread(rng, problem, draws, index, power, kinds)
     shape = structure.shape
     changed = reweighed(
         evidence,
@@ -135,11 +139,10 @@ def infer_noise(
             reasons[i].append(
                 f"inferring the noise ended at a power of {power[i]:.3g}, not at 1"
             )
-        if likeness[i] > _TOO_ALIKE:
+        if worth[i] < _TOO_FEW:
             reasons[i].append(
-                f"inferring the noise left few lineages of draws, which {_MOST_MOVES} "
-                f"moves did not part: a correlation of {likeness[i]:.2f} with where "
-                "they were"
+                f"inferring the noise left draws that are worth {worth[i]:.0f} "
+                f"independent ones, below {_TOO_FEW:.0f}, after {_MOST_MOVES} moves"
             )
         if left[i] < _LEAST_LEFT * structure[0].size:
             reasons[i].append(
@@ -209,11 +212,9 @@ def _spread(
     draws: NoiseDraws,
     index: np.ndarray,
     power: np.ndarray,
+    kinds: MoveKinds,
 ) -> tuple[NoiseDraws, np.ndarray]:
-    """Move on the draws of objects of which few lineages are left.
-
-    Draws of one lineage are alike, those of a few cover less than the posterior. They
-    are moved until little is left of where they were.
+    """Move on the draws of objects that are worth too few independent ones.
 
     Args:
         rng: source of randomness.
@@ -221,78 +222,55 @@ def _spread(
         draws: the list.
         index: object of each draw.
         power: of each object.
+        kinds: of moves.
 
     Returns:
-        The draws, and the largest correlation of any number before and after, of each
-        object; zero where there was no need.
+        The draws, and what those of each object are worth.
     """
-    num_objects = len(power)
-    likeness = np.zeros(num_objects)
-    size = _lineages(draws.root.reshape(num_objects, -1))
-    asked = np.flatnonzero(size < _FEW_LINEAGES)
-    if not asked.size:
-        return draws, likeness
-    rows = np.flatnonzero(np.isin(index, asked))
-    few, own_index, own = draws.take(rows), index[rows], problem.only(rows)
-    begin = here = np.concatenate([few.z, few.vector], axis=1)
-    reach = dict.fromkeys(KINDS, np.inf)
-    for number in range(_MOST_MOVES):
-        # The kind that goes farther, and now and then the other, which may by now.
-        kind = (min if number % 4 == 3 else max)(reach, key=lambda k: reach[k])
-        few = own.move(rng, few, power, kind)
-        last, here = here, np.concatenate([few.z, few.vector], axis=1)
-        reach[kind] = _reach(last, here)
+    worth = np.zeros(len(power))
+    asked = np.arange(len(power))
+    for number in range(_MOST_MOVES + 1):
+        offset = problem.offsets(draws)
         for i in asked:
-            mine = own_index == i
-            likeness[i] = _likeness(begin[mine], here[mine], few.group[mine])
-        if np.all(likeness < _MOST_ALIKE):
+            mine = index == i
+            worth[i] = worth_of_draws(offset[mine], draws.root[mine], draws.group[mine])
+        asked = np.flatnonzero(worth < _ENOUGH)
+        if not asked.size or number == _MOST_MOVES:
             break
+        rows = np.flatnonzero(np.isin(index, asked))
+        draws = _moved(rng, problem, draws, rows, power, kinds)
+    return draws, worth
+
+
+def _moved(
+    rng: np.random.Generator,
+    problem: NoiseProblem,
+    draws: NoiseDraws,
+    rows: np.ndarray,
+    power: np.ndarray,
+    kinds: MoveKinds,
+) -> NoiseDraws:
+    """One move of some of the draws, of the kind that suits their groups."""
+    some = draws.take(rows)
+    chosen = kinds.choose(some.values, some.group)
+    after = problem.only(rows).move(rng, some, power, chosen)
+    kinds.learn(chosen, some.values, after.values, some.group)
     joined = [np.array(part) for part in draws]
-    for whole, part in zip(joined, few, strict=True):
+    for whole, part in zip(joined, after, strict=True):
         whole[rows] = part
-    return NoiseDraws(*joined), likeness
+    return NoiseDraws(*joined)
 
 
-def _lineages(root: np.ndarray) -> np.ndarray:
-    """How many lineages of equal size would be as uneven, `[object]`."""
-    counts = [np.unique(each, return_counts=True)[1] for each in root]
-    return np.array([num.sum() ** 2 / (num**2).sum() for num in counts], float)
+def _resample(
+    rng: np.random.Generator, log_weight: np.ndarray, is_asked: np.ndarray
+) -> np.ndarray:
+    """Rows of the chosen draws, chain by chain, in random order.
 
-
-def _reach(before: np.ndarray, after: np.ndarray) -> float:
-    """Mean square of a move over the variance, of the middle one of all numbers.
-
-    Zero where no number varies, as with a single draw.
+    Args:
+        rng: source of randomness.
+        log_weight: `[object, chain, draw]`.
+        is_asked: objects of which any are chosen; the others keep all of theirs.
     """
-    spread = after.var(axis=0)
-    seen = spread > 0
-    if not np.any(seen):
-        return 0.0
-    square = np.mean((after - before)[:, seen] ** 2, axis=0)
-    return float(np.median(square / spread[seen]))
-
-
-def _likeness(before: np.ndarray, after: np.ndarray, group: np.ndarray) -> float:
-    """Largest correlation of any number, `[draw, number]` before and after moves.
-
-    Within groups, which moves do not leave; those of a few draws are passed over.
-    """
-    largest = 0.0
-    for name, num in zip(*np.unique(group, return_counts=True), strict=True):
-        if num < _COUNTED_SHARE * len(group):
-            continue
-        a, b = (
-            x[group == name] - x[group == name].mean(axis=0) for x in (before, after)
-        )
-        length = np.sqrt(np.sum(a**2, axis=0) * np.sum(b**2, axis=0))
-        seen = length > 0
-        each = np.sum(a * b, axis=0)[seen] / length[seen]
-        largest = float(np.max(each, initial=largest))
-    return largest
-
-
-def _resample(rng: np.random.Generator, log_weight: np.ndarray) -> np.ndarray:
-    """Rows of the chosen draws, chain by chain, in random order."""
     num_objects, num_chains, num = log_weight.shape
     top = log_weight.max(axis=-1, keepdims=True)
     is_lost = ~np.isfinite(top)
@@ -300,5 +278,8 @@ def _resample(rng: np.random.Generator, log_weight: np.ndarray) -> np.ndarray:
     rows = []
     for i, c in np.ndindex(num_objects, num_chains):
         begin = (i * num_chains + c) * num
+        if not is_asked[i]:
+            rows.append(begin + np.arange(num))
+            continue
         rows.append(begin + rng.permutation(systematic(rng, weight[i, c], num)))
     return np.concatenate(rows)

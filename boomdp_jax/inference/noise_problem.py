@@ -10,7 +10,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from boomdp_jax.inference.draw_moves import Proposed, about_means, by_differences
+from boomdp_jax.inference.draw_moves import (
+    Proposed,
+    about_means,
+    by_differences,
+    from_means,
+)
 from boomdp_jax.inference.evaluate import evaluate_points, log_prior_density
 from boomdp_jax.inference.filter_points import filter_densities
 from boomdp_jax.inference.fit import Fits, Host
@@ -20,9 +25,6 @@ from boomdp_jax.inference.noise_proposal import NoiseProposal, best_of_groups, g
 from boomdp_jax.inference.noise_transport import NoiseTransport
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.tempered_smc import times
-
-KINDS = ("mean", "difference")
-"""Kinds of moves, to be made in turn."""
 
 # Length of steps by differences.
 _STEP_SIZE = 0.4
@@ -54,6 +56,11 @@ class NoiseDraws(NamedTuple):
         """By how much the last density exceeds the first; of logarithms."""
         ratio = self.log_last - self.log_first
         return np.where(np.isfinite(ratio), ratio, -np.inf)
+
+    @property
+    def values(self) -> np.ndarray:
+        """All that a move changes, `[draw, number]`."""
+        return np.concatenate([self.z, self.vector], axis=1)
 
     def take(self, rows: np.ndarray) -> "NoiseDraws":
         """Some of them."""
@@ -141,6 +148,15 @@ class NoiseProblem:
         problem = cls(targets, index, proposal, transport, is_moved)
         return problem, problem._given(draws, vector, group, np.arange(len(group)))
 
+    @property
+    def num_groups(self) -> int:
+        """Groups of draws there are."""
+        return len(self._is_moved)
+
+    def offsets(self, draws: NoiseDraws) -> np.ndarray:
+        """By how much what moves change differs from the mean of the group."""
+        return from_means(draws.values, draws.group, self._period(draws))
+
     def only(self, rows: np.ndarray) -> "NoiseProblem":
         """The same for some of the draws."""
         return NoiseProblem(
@@ -152,7 +168,11 @@ class NoiseProblem:
         )
 
     def move(
-        self, rng: np.random.Generator, draws: NoiseDraws, power: np.ndarray, kind: str
+        self,
+        rng: np.random.Generator,
+        draws: NoiseDraws,
+        power: np.ndarray,
+        is_about_mean: np.ndarray,
     ) -> NoiseDraws:
         """One Metropolis step of every draw, along the spread of its group.
 
@@ -160,10 +180,11 @@ class NoiseProblem:
             rng: source of randomness.
             draws: the list.
             power: how far from the first density to the last, of each object.
-            kind: one of `KINDS`.
+            is_about_mean: of which of the two kinds (`draw_moves`) the move of each
+                group is.
         """
         power = power[self._index]
-        proposed = self._propose(rng, draws, kind)
+        proposed = self._propose(rng, draws, is_about_mean[draws.group])
         dim = draws.z.shape[1]
         z, vector = proposed.values[:, :dim], proposed.values[:, dim:]
         trial = self._with_last(draws._replace(z=z, vector=vector))
@@ -205,14 +226,21 @@ class NoiseProblem:
         value = value + log_noise_prior(self._scale, draws.vector) + log_volume
         return draws._replace(moved=z, log_last=value, log_volume=log_volume)
 
-    def _propose(self, rng, draws: NoiseDraws, kind: str) -> Proposed:
-        values = np.concatenate([draws.z, draws.vector], axis=1)
-        num_noise = draws.vector.shape[1]
-        period = np.concatenate([self._host.period, np.zeros(num_noise)])
-        if kind == "mean":
-            return about_means(rng, values, draws.group, period)
-        num_moved = self._host.in_use.sum(axis=1)[draws.structure] + num_noise
-        return by_differences(rng, values, draws.group, period, num_moved, _STEP_SIZE)
+    def _propose(self, rng, draws: NoiseDraws, is_about_mean: np.ndarray) -> Proposed:
+        values, period, group = draws.values, self._period(draws), draws.group
+        num_moved = self._host.in_use.sum(axis=1)[draws.structure]
+        num_moved = num_moved + draws.vector.shape[1]
+        near = by_differences(rng, values, group, period, num_moved, _STEP_SIZE)
+        if not np.any(is_about_mean):
+            return near
+        far = about_means(rng, values, group, period)
+        return Proposed(
+            np.where(is_about_mean[:, None], far.values, near.values),
+            np.where(is_about_mean, far.log_ratio, near.log_ratio),
+        )
+
+    def _period(self, draws: NoiseDraws) -> np.ndarray:
+        return np.concatenate([self._host.period, np.zeros(draws.vector.shape[1])])
 
 
 def effective_size(log_weight: np.ndarray) -> float:

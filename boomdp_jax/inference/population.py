@@ -22,7 +22,7 @@ from boomdp_jax.core.arrays import Key, on_device
 from boomdp_jax.inference.adapt_mixture import adapt_mixtures
 from boomdp_jax.inference.importance_evidence import ImportanceEvidence
 from boomdp_jax.inference.laplace_mixture import LaplaceMixture
-from boomdp_jax.inference.moves import Point
+from boomdp_jax.inference.moves import MOVES, Point
 from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.resampling import resample_walkers
 from boomdp_jax.inference.spare_fit import fit_spare
@@ -36,11 +36,17 @@ from boomdp_jax.inference.walker_moves import (
     no_moves,
     propose_all,
 )
-from boomdp_jax.inference.weighing import evaluate_each
+from boomdp_jax.inference.weighing import (
+    evaluate_asked,
+    evaluate_each,
+    taken_over,
+)
 
 # Moves of one sweep, by name.
 _CYCLE = ("jump", "walk", "change", "walk", "jump")
-_WALK_ACCEPT = 0.4
+# Of changes such a share has to be accepted in warm-up, less one, or an object makes no
+# more of them: where one structure has nearly all, each is a likelihood for nothing.
+_LEAST_ACCEPTED = 0.01
 
 
 class PopulationSettings(NamedTuple):
@@ -50,14 +56,14 @@ class PopulationSettings(NamedTuple):
     num_walkers: int = 64
     """Of each chain."""
     num_warmup: int = 4
-    """Sweeps that adapt the walk's step size and are thrown away."""
+    """Sweeps that a last component is fitted to and that are thrown away."""
     num_sweeps: int = 8
     """Sweeps that are kept; each gives one draw per walker."""
     num_importance: int = 2048
     """Draws of each round that adapts the mixture; the last ones are the evidence."""
     max_doublings: int = 2
-    """How often the number of sweeps may double, of which then every second is kept,
-    where the chains do not agree yet."""
+    """How often the number of sweeps of an object may double, of which then every
+    second is kept, where its chains do not agree yet."""
 
 
 class Population(NamedTuple):
@@ -77,7 +83,7 @@ def sample_population(
     settings: PopulationSettings,
     *,
     evaluate: Callable[..., Array] | None = None,
-    is_mixed: Callable[[ChainDraws], bool] = lambda draws: True,
+    is_mixed: Callable[[ChainDraws], np.ndarray | bool] = lambda draws: True,
 ) -> Population:
     """Draw from the posteriors of a batch of objects.
 
@@ -87,9 +93,9 @@ def sample_population(
         mixtures: one of each object.
         settings: how much to draw.
         evaluate: from targets, structures `[object, point]` and coordinates `[object,
-            point, dim]` to log-densities `[object, point]`; default: that of the
-            targets, in chunks.
-        is_mixed: whether draws `[object, chain, draw]` of all objects will do.
+            point, dim]` to log-densities `[object, point]`, and of some objects only
+            if these are told, `[object]`; default: that of the targets, in chunks.
+        is_mixed: whether draws `[object, chain, draw]` of each object will do.
 
     Returns:
         Draws of every chain, move counts, and evidence by importance sampling.
@@ -103,43 +109,50 @@ def sample_population(
         evidence, targets, mixtures, settings.num_chains, settings.num_walkers
     )
     num_objects = targets.structures.shape[0]
-    step_size = np.full(num_objects, 0.5)
     counts = no_moves(num_objects)
+    is_open = can_change = np.ones(num_objects, bool)
 
-    def sweep_once(points: Point, mixtures: LaplaceMixture, is_warm_up: bool) -> Point:
+    def sweep_once(points: Point, mixtures: LaplaceMixture) -> Point:
         for move in _CYCLE:
-            batch = propose_all(move, rng, points, targets, mixtures, step_size)
-            proposal = batch.proposal
-            log_density = evaluate(targets, proposal.structure, proposal.z)
+            is_asked = is_open & (can_change | (move != "change"))
+            if not np.any(is_asked):
+                continue
+            batch = propose_all(move, rng, points, targets, mixtures)
+            where = batch.proposal.structure, batch.proposal.z
+            log_density = evaluate_asked(evaluate, targets, *where, is_asked)
             points, info = decide_all(rng, points, batch, log_density)
-            if not is_warm_up:
-                count_moves(counts, move, info)
-            elif move == "walk":
-                rate = np.mean(np.asarray(info.accept_probability, float), axis=1)
-                step_size[:] *= np.exp(rate - _WALK_ACCEPT)
-                np.clip(step_size, 0.02, 0.98, out=step_size)
+            count_moves(counts, move, info, is_asked)
         return points
 
+    places = []
     for _ in range(settings.num_warmup):
-        points = sweep_once(points, mixtures, True)
-    if settings.num_warmup > 0:
-        places = np.asarray(points.structure), np.asarray(points.z)
-        mixtures = fit_spare(targets, mixtures, *places)
+        points = sweep_once(points, mixtures)
+        places.append((np.asarray(points.structure), np.asarray(points.z)))
+    if places:
+        proposed, accepted = (c[:, MOVES.index("change")].sum(axis=1) for c in counts)
+        can_change = accepted + 1 >= _LEAST_ACCEPTED * proposed
+        counts = no_moves(num_objects)
+        visited = (np.concatenate(part, axis=1) for part in zip(*places, strict=True))
+        mixtures = fit_spare(targets, mixtures, *visited)
         proposal = log_proposal_of(targets, mixtures, points.structure, points.z)
         points = eqx.tree_at(lambda p: p.log_proposal, points, proposal)
-    kept, every = [], 1
+    draws, kept, every = None, [], 1
     for doubling in range(settings.max_doublings + 1):
         if doubling > 1:
             every *= 2
         for _ in range(settings.num_sweeps):
             for _ in range(every):
-                points = sweep_once(points, mixtures, False)
+                points = sweep_once(points, mixtures)
             kept.append(points)
         if doubling > 0:
             kept = kept[1::2]
-        draws = _arrange(kept, settings)
-        if is_mixed(draws):
+        latest = _arrange(kept, settings)
+        # Those whose chains agreed before have not moved since.
+        draws = latest if draws is None else taken_over(is_open, latest, draws)
+        is_open = is_open & ~np.broadcast_to(is_mixed(draws), num_objects)
+        if not np.any(is_open):
             break
+    assert draws is not None
     return Population(
         draws=draws,
         counts=counts,

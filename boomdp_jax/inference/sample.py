@@ -46,7 +46,7 @@ from boomdp_jax.inference.tempered_smc import sample_tempered
 from boomdp_jax.inference.walker_moves import MoveCounts
 from boomdp_jax.inference.weighing import evaluate_each
 
-# Chains go on where an R-hat of any object exceeds this.
+# Chains of an object go on where an R-hat exceeds this.
 _R_HAT = 1.015
 # Importance sampling is heard only with as many effective draws.
 _MIN_SAMPLE_SIZE = 100.0
@@ -233,7 +233,7 @@ def sample_by_jumps(
         start_mixtures(targets, modes),
         settings.population,
         evaluate=evaluate,
-        is_mixed=lambda draws: _is_mixed(targets, draws),
+        is_mixed=lambda draws: _are_mixed(targets, draws),
     )
     draws = population.draws
     evidence = evidence_by_importance(
@@ -314,7 +314,7 @@ def _rehearse(
         settings._replace(num_warmup=1, num_samples=settings.population.num_walkers)
         if draw is sample_by_jumps
         else settings,
-        lambda targets, structure, z: -0.5 * (z**2).sum(axis=-1),
+        lambda targets, structure, z, *_: -0.5 * (z**2).sum(axis=-1),
     )
     if with_filters:
         # One of the sizes that tracks have; each is a program, if a small one. The
@@ -324,13 +324,15 @@ def _rehearse(
         LinearTracks.along(*known, noise)(first, noise)
 
 
-def _is_mixed(targets: StructureTarget, draws: ChainDraws) -> bool:
-    """Whether the chains of every object agree."""
-    for index in range(targets.structures.shape[0]):
-        verdict = diagnose_chains(*pick_object((targets, draws), index))
-        if max(verdict.r_hat.values(), default=1.0) > _R_HAT:
-            return False
-    return True
+def _are_mixed(targets: StructureTarget, draws: ChainDraws) -> np.ndarray:
+    """Whether the chains of each object agree, `[object]`."""
+    verdicts = [
+        diagnose_chains(*pick_object((targets, draws), index))
+        for index in range(targets.structures.shape[0])
+    ]
+    largest = [max(verdict.r_hat.values(), default=1.0) for verdict in verdicts]
+    # Too few draws to tell count as agreeing: more would be as few.
+    return ~(np.array(largest) > _R_HAT)
 
 
 def _diagnose(

@@ -60,7 +60,6 @@ _NUM_ISLANDS = 16
 _KEPT_SHARE = 0.6
 _CYCLE = ("jump", "walk", "change", "walk")
 _LAST_CYCLES = 3
-_WALK_STEP, _WALK_ACCEPT = 0.5, 0.4
 # Share of the first particles that is spread evenly over structures.
 _EVEN_SHARE = 0.5
 # Importance sampling, on the side, is heard only with as many effective draws.
@@ -173,7 +172,7 @@ def temper(
     num_objects, num_each = targets.structures.shape[0], num_particles // _NUM_ISLANDS
     power = np.zeros(num_objects)
     log_whole = np.zeros((num_objects, _NUM_ISLANDS))
-    counts, step_size = no_moves(num_objects), np.full(num_objects, _WALK_STEP)
+    counts = no_moves(num_objects)
     for _ in range(_MAX_STEPS):
         log_ratio = _log_ratio(particles)
         step = np.array(
@@ -191,13 +190,9 @@ def temper(
         is_last = bool(np.all(power >= 1.0))
         for move in _CYCLE * (_LAST_CYCLES if is_last else 1):
             particles, info = _move(
-                move, rng, particles, targets, mixtures, power, step_size, evaluate
+                move, rng, particles, targets, mixtures, power, evaluate
             )
             count_moves(counts, move, info)
-            if move == "walk":
-                rate = np.mean(np.asarray(info.accept_probability, float), axis=1)
-                step_size = step_size * np.exp(rate - _WALK_ACCEPT)
-                step_size = np.clip(step_size, 0.02, 0.98)
         if is_last:
             break
     return Tempered(particles, log_whole, counts, power)
@@ -319,12 +314,11 @@ def _move(
     targets: StructureTarget,
     mixtures: LaplaceMixture,
     power: np.ndarray,
-    step_size: np.ndarray,
     evaluate: Callable[..., Array],
 ):
     """One move of every particle under the tempered density."""
     points = particles.points
-    batch = propose_all(move, rng, points, targets, mixtures, step_size)
+    batch = propose_all(move, rng, points, targets, mixtures)
     where = batch.proposal.structure, batch.proposal.z
     log_target = evaluate(targets, *where).astype(points.z.dtype)
     log_density = _temper(log_target, batch.log_proposal, power)

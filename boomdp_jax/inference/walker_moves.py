@@ -14,7 +14,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import on_device
+from boomdp_jax.core.one_by_one import one_by_one
 from boomdp_jax.core.quick_compile import QuickCompile
+from boomdp_jax.inference.draw_moves import walk_share
 from boomdp_jax.inference.laplace_mixture import LaplaceMixture
 from boomdp_jax.inference.moves import (
     MOVES,
@@ -46,7 +48,7 @@ def log_proposal_of(targets, mixtures, structure, z):
     def one(target, mixture, structure, z):
         return jax.vmap(lambda k, z: mixture.log_density(target, k, z))(structure, z)
 
-    return jax.vmap(one)(targets, mixtures, structure, z)
+    return one_by_one(one, targets, mixtures, structure, z)
 
 
 class Batch(NamedTuple):
@@ -63,11 +65,11 @@ def _propose(
     points: Point,
     targets: StructureTarget,
     mixtures: LaplaceMixture,
-    step_size: Float[Array, " object"],
 ) -> Batch:
-    def one(noise, point, target, mixture, step_size):
+    def one(noise, point, target, mixture):
         if move == "walk":
-            proposal = propose_walk(noise, point, target, mixture, step_size)
+            size = walk_share(noise.choice[1])
+            proposal = propose_walk(noise, point, target, mixture, size)
         elif move == "change":
             proposal = propose_change(noise, point, target, mixture, _PRIOR_SHARE)
         else:
@@ -86,8 +88,9 @@ def _propose(
             proposal = proposal._replace(log_correction=correction)
         return Batch(proposal, log_proposal)
 
-    over = jax.vmap(jax.vmap(one, (0, 0, None, None, None)))
-    return over(noise, points, targets, mixtures, step_size)
+    return one_by_one(
+        jax.vmap(one, (0, 0, None, None)), noise, points, targets, mixtures
+    )
 
 
 @QuickCompile
@@ -115,12 +118,10 @@ def propose_all(
     points: Point,
     targets: StructureTarget,
     mixtures: LaplaceMixture,
-    step_size: np.ndarray,
 ) -> Batch:
     """A proposal of every walker."""
     noise = batch_noise(rng, targets, mixtures, points.structure.shape[1])
-    size = on_device(step_size, points.z.dtype)
-    return _propose(move, noise, points, targets, mixtures, size)
+    return _propose(move, noise, points, targets, mixtures)
 
 
 def decide_all(
@@ -142,11 +143,22 @@ def no_moves(num_objects: int) -> MoveCounts:
     return MoveCounts(np.zeros(shape, int), np.zeros(shape, int))
 
 
-def count_moves(counts: MoveCounts, move: str, info: MoveInfo) -> None:
-    """Add the outcomes of one move to the counts, in place."""
+def count_moves(
+    counts: MoveCounts, move: str, info: MoveInfo, is_asked: np.ndarray | None = None
+) -> None:
+    """Add the outcomes of one move to the counts, in place.
+
+    Args:
+        counts: to add to.
+        move: its name.
+        info: outcomes of all walkers of all objects.
+        is_asked: objects whose moves count; None: all.
+    """
     index = MOVES.index(move)
     is_made, is_taken = np.asarray(info.is_made), np.asarray(info.accepted)
+    if is_asked is not None:
+        is_made = is_made & is_asked[:, None]
     changes = np.asarray(info.changes_structure)
     for column, mask in enumerate((~changes, changes)):
         counts.proposed[:, index, column] += np.sum(is_made & mask, axis=1)
-        counts.accepted[:, index, column] += np.sum(is_taken & mask, axis=1)
+        counts.accepted[:, index, column] += np.sum(is_made & is_taken & mask, axis=1)

@@ -1,12 +1,15 @@
 """Weights of mixtures and evidence of structures, for batches of objects."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from boomdp_jax.core.arrays import on_device
+from boomdp_jax.core.one_by_one import one_by_one
 from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.inference.evaluate import evaluate_points
 from boomdp_jax.inference.importance_evidence import (
@@ -26,7 +29,7 @@ _FLOOR = 0.3
 
 @QuickCompile
 def _draw(offset, noise, targets: StructureTarget, mixtures: LaplaceMixture):
-    return jax.vmap(draws_of_noise)(offset, noise, targets, mixtures)
+    return one_by_one(draws_of_noise, offset, noise, targets, mixtures)
 
 
 @QuickCompile
@@ -40,6 +43,7 @@ def weigh(
     mixtures: LaplaceMixture,
     num_draws: int,
     evaluate: Callable[..., Array],
+    is_asked: np.ndarray | None = None,
 ) -> ImportanceEvidence:
     """Draw from mixtures and weigh the draws.
 
@@ -49,12 +53,17 @@ def weigh(
         mixtures: one of each object.
         num_draws: of each object.
         evaluate: log-densities of as many points of every object.
+        is_asked: objects whose draws are weighed, `[object]`; None: all. Of the others
+            nothing that is returned means anything.
     """
     num_objects = targets.structures.shape[0]
     noise = batch_noise(rng, targets, mixtures, num_draws)
     offset = on_device(rng.random(num_objects), noise.normal.dtype)
     draws = _draw(offset, noise, targets, mixtures)
-    return _weigh_all(targets, draws, evaluate(targets, draws.structure, draws.z))
+    where = draws.structure, draws.z
+    return _weigh_all(
+        targets, draws, evaluate_asked(evaluate, targets, *where, is_asked)
+    )
 
 
 def batch_noise(
@@ -73,25 +82,72 @@ def evaluate_each(
     targets: StructureTarget,
     structure: Int[Array, "object point"],
     z: Float[Array, "object point dim"],
+    is_asked: np.ndarray | None = None,
 ) -> Float[Array, "object point"]:
-    """Log-densities of as many points of every object."""
+    """Log-densities of as many points of every object.
+
+    Args:
+        targets: with a `FilteredLikelihood`, stacked along a leading object axis.
+        structure: of each point.
+        z: coordinates of each point.
+        is_asked: objects whose points are evaluated, `[object]`; None: all. Those of
+            the others get minus infinity.
+    """
     num_objects, num = structure.shape
+    asked = np.arange(num_objects) if is_asked is None else np.flatnonzero(is_asked)
     found = evaluate_points(
         targets,
-        np.repeat(np.arange(num_objects), num),
-        np.asarray(structure).reshape(-1),
-        np.asarray(z).reshape(num_objects * num, -1),
+        np.repeat(asked, num),
+        np.asarray(structure)[asked].reshape(-1),
+        np.asarray(z)[asked].reshape(len(asked) * num, -1),
     )
-    return on_device(found.log_density.reshape(num_objects, num))
+    out = np.full((num_objects, num), -np.inf)
+    out[asked] = found.log_density.reshape(len(asked), num)
+    return on_device(out)
+
+
+def evaluate_asked(
+    evaluate: Callable[..., Array],
+    targets: StructureTarget,
+    structure: Int[Array, "object point"],
+    z: Float[Array, "object point dim"],
+    is_asked: np.ndarray | None,
+) -> Float[Array, "object point"]:
+    """The same by any function, which knows of a choice where not all are asked."""
+    if is_asked is None or np.all(is_asked):
+        return evaluate(targets, structure, z)
+    return evaluate(targets, structure, z, is_asked)
+
+
+@QuickCompile
+def _take_over(is_asked, new, old):
+    def one(a, b):
+        return jnp.where(is_asked.reshape(-1, *(1 for _ in a.shape[1:])), a, b)
+
+    return jax.tree.map(one, new, old)
+
+
+def taken_over(is_asked: np.ndarray, new: Any, old: Any) -> Any:
+    """What is new of the objects asked, what was known of the others.
+
+    Args:
+        is_asked: `[object]`.
+        new: tree of arrays with a leading object axis.
+        old: such a tree.
+    """
+    if np.all(is_asked):
+        return new
+    return _take_over(on_device(is_asked, bool), new, old)
 
 
 @QuickCompile
 def _refine_all(targets: StructureTarget, mixtures: LaplaceMixture, evidence):
-    return jax.vmap(
+    return one_by_one(
         lambda t, m, e: refine_weights(
             t, m, e.structure, e.z, e.log_weight, floor=_FLOOR
-        )
-    )(targets, mixtures, evidence)
+        ),
+        *(targets, mixtures, evidence),
+    )
 
 
 def refine(

@@ -8,7 +8,6 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import multivariate_t
 
-from boomdp_jax.inference import noise_correction
 from boomdp_jax.inference.infer import infer
 from boomdp_jax.inference.noise_level import NoiseFit, log_noise_prior, prior_noise
 from tests.inference.joint_normal import joint_normal
@@ -99,33 +98,3 @@ def test_mass_noise_and_evidence_are_those_of_the_joint_density(reference, metho
     np.testing.assert_allclose(ratio[1:], 1.0, atol=0.35)
     error = posterior.diagnostics["log_evidence_error"]
     assert abs(float(posterior.log_evidence) - evidence) < 0.05 + 4.0 * error
-
-
-def test_lineages_count_by_their_size():
-    root = np.array([[0, 0, 3, 3], [0, 1, 2, 3], [1, 1, 1, 1], [0, 0, 0, 3]])
-    expected = [2.0, 4.0, 1.0, 16.0 / 10.0]
-    np.testing.assert_allclose(noise_correction._lineages(root), expected)
-
-
-def test_likeness_is_the_largest_correlation_of_any_number_within_groups():
-    rng = np.random.default_rng(3)
-    before = rng.normal(size=(4000, 3)) * [1.0, 20.0, 0.0]
-    after = rng.normal(size=before.shape)
-    group = np.repeat([0, 1, 2], [2000, 1900, 100])
-    # Moves do not leave a group: that its numbers lie elsewhere is no likeness.
-    before[:2000] += 7.0
-    after[:2000] += 7.0
-    assert noise_correction._likeness(before, after, group) < 0.12
-    # A structure of a fortieth of the draws is passed over.
-    after[group == 2] = before[group == 2]
-    assert noise_correction._likeness(before, after, group) < 0.12
-    # Covariance 0.6 and unit variances.
-    after[:2000, 1] = 0.6 * before[:2000, 1] / 20.0 + 0.8 * after[:2000, 1]
-    found = noise_correction._likeness(before, after, group)
-    assert found == pytest.approx(0.6, abs=0.06)
-
-
-def test_a_single_draw_reaches_nowhere(recwarn):
-    point = np.zeros((1, 3))
-    assert noise_correction._reach(point, point + 1.0) == 0.0
-    assert not recwarn.list

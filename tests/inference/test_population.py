@@ -144,3 +144,61 @@ def test_sweeps_double_until_the_chains_agree(problem, num_refusals):
     assert num_calls == 5 * num_sweeps
     assert found.counts.proposed.sum() <= 5 * 16 * (num_sweeps - settings.num_warmup)
     assert found.counts.proposed.sum() > 3 * 16 * (num_sweeps - settings.num_warmup)
+
+
+def test_objects_whose_chains_agree_are_left_alone(problem):
+    targets, target, laplace = problem
+    mixture = add_spare_components(target, laplace)
+    two = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), mixture)
+    both = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * 2), targets)
+    settings = PopulationSettings(
+        num_chains=2, num_walkers=8, num_warmup=1, num_sweeps=3, num_importance=64
+    )
+    seen, asked = [], []
+
+    def are_mixed(draws):
+        seen.append(np.asarray(draws.z))
+        return np.array([len(seen) > 1, len(seen) > 2])
+
+    def evaluate(targets, structure, z, is_asked=None):
+        if structure.shape[1] == 16:
+            asked.append([True, True] if is_asked is None else is_asked.tolist())
+        value = jnp.zeros(structure.shape, z.dtype)
+        if is_asked is None:
+            return value
+        return jnp.where(jnp.asarray(is_asked)[:, None], value, -jnp.inf)
+
+    found = sample_population(
+        jax.random.key(4), both, two, settings, evaluate=evaluate, is_mixed=are_mixed
+    )
+    # The first is done after two rounds, the second goes on for twice as long.
+    assert asked.count([True, True]) == 5 * (1 + 3 + 3)
+    assert asked.count([False, True]) == 5 * 6
+    np.testing.assert_array_equal(seen[2][0], seen[1][0])
+    assert not np.array_equal(seen[2][1], seen[1][1])
+    np.testing.assert_array_equal(np.asarray(found.draws.z), seen[2])
+    proposed = found.counts.proposed.sum(axis=(1, 2))
+    assert proposed[1] == pytest.approx(2 * proposed[0], rel=0.1)
+
+
+def test_changes_that_nobody_accepts_are_given_up_after_warm_up(problem):
+    targets, target, laplace = problem
+    mixture = add_spare_components(target, laplace)
+    stacked = jax.tree.map(lambda leaf: leaf[None], mixture)
+    settings = PopulationSettings(
+        num_chains=2, num_walkers=70, num_warmup=2, num_sweeps=3, num_importance=64
+    )
+    num_calls = 0
+
+    def evaluate(targets, structure, z):
+        nonlocal num_calls
+        num_calls += structure.shape[1] == 140
+        # One structure has all.
+        return jnp.where(structure == 1, 0.0, -1e4).astype(z.dtype)
+
+    found = sample_population(
+        jax.random.key(4), targets, stacked, settings, evaluate=evaluate
+    )
+    assert num_calls == 5 * 2 + 4 * 3
+    assert found.counts.proposed[0, 1].sum() == 0
+    assert np.all(np.asarray(found.draws.structure) == 1)
