@@ -54,9 +54,9 @@ class Walked(NamedTuple):
 
     points: Point
     counts: MoveCounts
-    places: tuple[np.ndarray, np.ndarray]
+    places: tuple[np.ndarray, ...]
     """Structures `[object, place]` and coordinates `[object, place, dim]` after each
-    step but the first few."""
+    step but the first few, if they were asked for."""
 
 
 def adapt_mixtures(
@@ -75,7 +75,7 @@ def adapt_mixtures(
         targets: stacked along a leading object axis.
         mixtures: one of each object, with spare components.
         num_draws: of each round and object.
-        evaluate: log-densities of as many points of every object.
+        evaluate: as `weighing.evaluate_each`.
         max_rounds: rounds of walks, at least 1; fewer where draws are enough, or where
             there come to be no more of them.
 
@@ -90,7 +90,8 @@ def adapt_mixtures(
     is_open = np.ones(targets.structures.shape[0], bool)
     most = np.zeros(targets.structures.shape[0])
     for number in range(max_rounds):
-        walked = walk(rng, points, targets, mixtures, evaluate, _NUM_WALKS * is_open)
+        known = points, targets, mixtures, evaluate
+        walked = walk(rng, *known, _NUM_WALKS * is_open, with_places=True)
         points = walked.points
         fitted = fit_spare(targets, mixtures, *walked.places)
         again = weigh(rng, targets, fitted, num_draws, evaluate, is_open)
@@ -114,6 +115,8 @@ def walk(
     mixtures: LaplaceMixture,
     evaluate: Callable[..., Array],
     num_walks: np.ndarray,
+    *,
+    with_places: bool = False,
 ) -> Walked:
     """Some steps of every walker within its structure.
 
@@ -122,8 +125,9 @@ def walk(
         points: where walkers stand.
         targets: stacked along a leading object axis.
         mixtures: one of each object.
-        evaluate: log-densities of as many points of every object.
+        evaluate: as `weighing.evaluate_each`.
         num_walks: steps of the walkers of each object, `[object]`.
+        with_places: whether to keep where they come by.
     """
     log_proposal = log_proposal_of(targets, mixtures, points.structure, points.z)
     points = eqx.tree_at(lambda p: p.log_proposal, points, log_proposal)
@@ -136,12 +140,10 @@ def walk(
         log_density = evaluate_asked(evaluate, targets, *where, is_asked)
         points, info = decide_all(rng, points, batch, log_density)
         count_moves(counts, "walk", info, is_asked)
-        if number >= _NUM_PASSED_OVER or number + 1 == num_walks.max():
+        if with_places and number >= _NUM_PASSED_OVER:
             places.append((np.asarray(points.structure), np.asarray(points.z)))
-    structures, z = (
-        np.concatenate(parts, axis=1) for parts in zip(*places, strict=True)
-    )
-    return Walked(points, counts, (structures, z))
+    joined = (np.concatenate(parts, axis=1) for parts in zip(*places, strict=True))
+    return Walked(points, counts, tuple(joined))
 
 
 def _least_size(evidence: ImportanceEvidence) -> np.ndarray:

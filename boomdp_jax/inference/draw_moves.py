@@ -11,8 +11,10 @@ Groups are draws of one structure of one object. Two kinds:
   q of that mean and covariance as it is, so that a posterior p is left as it is by
   accepting with $p(x') q(x) / p(x) q(x')$: the nearer to normal a posterior, the
   further one such move goes, in however many dimensions. Mean and covariance are those
-  of other draws than the ones that they move: a draw that shapes q has too much of it
-  where it stands, and leaves too easily.
+  of other draws than the ones that they move, and of none that were copied from the
+  same one: a draw that shapes q has too much of it where it stands, and leaves too
+  easily. All move at the same time, which leaves each draw its law if they were
+  independent, and ties draws that move each other a little.
 """
 
 from typing import NamedTuple
@@ -70,6 +72,7 @@ def about_means(
     values: np.ndarray,
     group: np.ndarray,
     period: np.ndarray,
+    root: np.ndarray | None = None,
 ) -> Proposed:
     """Moves that would keep the normal density of each group's mean and covariance.
 
@@ -81,14 +84,19 @@ def about_means(
         values: where draws are, `[draw, number]`.
         group: of each, `[draw]`.
         period: of each number; zero: it has none.
+        root: which draw each was copied from, `[draw]`; None: none was copied.
     """
     out, log_ratio = values.copy(), np.zeros(len(values))
+    root = np.arange(len(values)) if root is None else root
     for name in np.flatnonzero(are_enough(values, group)):
-        rows = rng.permutation(np.flatnonzero(group == name))
+        rows = np.flatnonzero(group == name)
         used = _varied(values[rows])
+        dealt = _dealt(rng, root[rows])
         for part in range(_NUM_PARTS):
-            mine = np.arange(len(rows)) % _NUM_PARTS == part
+            mine = dealt == part
             own, others = rows[mine], values[rows[~mine]]
+            if len(others) < _LEAST_FOR_EACH * used.size or not own.size:
+                continue
             moved, gain = _about_mean(
                 rng, values[np.ix_(own, used)], others[:, used], period[used]
             )
@@ -126,6 +134,18 @@ def from_means(values: np.ndarray, group: np.ndarray, period: np.ndarray) -> np.
         mine = group == name
         out[mine] = wrapped(values[mine] - _mean(values[mine], period), period)
     return out
+
+
+def _dealt(rng: np.random.Generator, root: np.ndarray) -> np.ndarray:
+    """Part of each draw: parts about equal, copies of one draw in the same."""
+    _, family, sizes = np.unique(root, return_inverse=True, return_counts=True)
+    part, filled = np.zeros(len(sizes), int), np.zeros(_NUM_PARTS)
+    order = rng.permutation(len(sizes))
+    # The largest families first, each where there is most room.
+    for name in order[np.argsort(-sizes[order], kind="stable")]:
+        part[name] = np.argmin(filled)
+        filled[part[name]] += sizes[name]
+    return part[family]
 
 
 def walk_share(uniform):

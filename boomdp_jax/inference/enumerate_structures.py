@@ -57,8 +57,7 @@ def enumerate_structures(
         targets: stacked along a leading object axis.
         modes: fitted modes of every structure.
         settings: how much to draw.
-        evaluate: from targets, structures `[object, point]` and coordinates `[object,
-            point, dim]` to log-densities `[object, point]`.
+        evaluate: as `weighing.evaluate_each`.
 
     Returns:
         Draws in chains that share nothing but the mixture, and the evidence.

@@ -45,9 +45,10 @@ _MAX_STEPS = 20
 _MOVES_BETWEEN, _LAST_MOVES = 1, 2
 # Where the first weights count for this share of the draws one move will do.
 _GOOD_SHARE = 0.5
-# Independent draws that those of an object are to be worth: they are moved on until
-# they are, at most so often. What is worth less than the last number is doubted.
-_ENOUGH, _MOST_MOVES, _TOO_FEW = 100.0, 24, 30.0
+# Independent draws that those of an object are to be worth, at most and as a share:
+# they are moved on until they are, or so often. What is worth far less is doubted.
+_ENOUGH, _ENOUGH_SHARE, _MOST_MOVES = 100.0, 0.05, 24
+_TOO_FEW, _TOO_FEW_SHARE = 30.0, 0.015
 # Distinct draws that are left of all, below which a result is doubted.
 _LEAST_LEFT = 0.02
 
@@ -112,8 +113,9 @@ def infer_noise(
         if steps == 0:
             first_size = np.array([effective_size(each) for each in ratio])
         log_weight = times(step[:, None], ratio).reshape(num_objects, num_chains, -1)
-        log_share += np.logaddexp.reduce(log_weight, axis=-1) - np.log(num_each)
         is_under_way = power < 1.0
+        log_mean = np.logaddexp.reduce(log_weight, axis=-1) - np.log(num_each)
+        log_share += np.where(is_under_way[:, None], log_mean, 0.0)
         power = np.where(step >= 1.0 - power, 1.0, power + step)
         draws = draws.take(_resample(rng, log_weight, is_under_way))
         steps += 1
@@ -139,10 +141,11 @@ def infer_noise(
             reasons[i].append(
                 f"inferring the noise ended at a power of {power[i]:.3g}, not at 1"
             )
-        if worth[i] < _TOO_FEW:
+        too_few = min(_TOO_FEW, _TOO_FEW_SHARE * structure[0].size)
+        if worth[i] < too_few:
             reasons[i].append(
                 f"inferring the noise left draws that are worth {worth[i]:.0f} "
-                f"independent ones, below {_TOO_FEW:.0f}, after {_MOST_MOVES} moves"
+                f"independent ones, below {too_few:.0f}, after {_MOST_MOVES} moves"
             )
         if left[i] < _LEAST_LEFT * structure[0].size:
             reasons[i].append(
@@ -229,12 +232,16 @@ def _spread(
     """
     worth = np.zeros(len(power))
     asked = np.arange(len(power))
+    enough = min(_ENOUGH, _ENOUGH_SHARE * len(index) / len(power))
     for number in range(_MOST_MOVES + 1):
         offset = problem.offsets(draws)
         for i in asked:
             mine = index == i
-            worth[i] = worth_of_draws(offset[mine], draws.root[mine], draws.group[mine])
-        asked = np.flatnonzero(worth < _ENOUGH)
+            worth[i] = worth_of_draws(
+                *(part[mine] for part in (draws.values, offset)),
+                *(draws.root[mine], draws.group[mine]),
+            )
+        asked = np.flatnonzero(worth < enough)
         if not asked.size or number == _MOST_MOVES:
             break
         rows = np.flatnonzero(np.isin(index, asked))

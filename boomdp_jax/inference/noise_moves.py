@@ -36,6 +36,7 @@ class MoveKinds:
             is_tried = ~(is_far_less & np.all(self._is_known, axis=0))
             is_about_mean = is_about_mean ^ is_tried
         enough = are_enough(values, group)
+        is_about_mean[len(enough) :] = False
         is_about_mean[: len(enough)] &= enough
         return is_about_mean
 

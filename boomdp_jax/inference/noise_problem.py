@@ -233,7 +233,7 @@ class NoiseProblem:
         near = by_differences(rng, values, group, period, num_moved, _STEP_SIZE)
         if not np.any(is_about_mean):
             return near
-        far = about_means(rng, values, group, period)
+        far = about_means(rng, values, group, period, draws.root)
         return Proposed(
             np.where(is_about_mean[:, None], far.values, near.values),
             np.where(is_about_mean, far.log_ratio, near.log_ratio),

@@ -44,8 +44,8 @@ from boomdp_jax.inference.weighing import (
 
 # Moves of one sweep, by name.
 _CYCLE = ("jump", "walk", "change", "walk", "jump")
-# Of changes such a share has to be accepted in warm-up, less one, or an object makes no
-# more of them: where one structure has nearly all, each is a likelihood for nothing.
+# Changes are of use where such a share of them is accepted in warm-up, less one: where
+# one structure has nearly all, each is a likelihood for nothing.
 _LEAST_ACCEPTED = 0.01
 
 
@@ -92,9 +92,7 @@ def sample_population(
         targets: with a `FilteredLikelihood`, stacked along a leading object axis.
         mixtures: one of each object.
         settings: how much to draw.
-        evaluate: from targets, structures `[object, point]` and coordinates `[object,
-            point, dim]` to log-densities `[object, point]`, and of some objects only
-            if these are told, `[object]`; default: that of the targets, in chunks.
+        evaluate: as `weighing.evaluate_each`, which is the default.
         is_mixed: whether draws `[object, chain, draw]` of each object will do.
 
     Returns:
@@ -129,8 +127,7 @@ def sample_population(
         points = sweep_once(points, mixtures)
         places.append((np.asarray(points.structure), np.asarray(points.z)))
     if places:
-        proposed, accepted = (c[:, MOVES.index("change")].sum(axis=1) for c in counts)
-        can_change = accepted + 1 >= _LEAST_ACCEPTED * proposed
+        can_change = _can_change(counts)
         counts = no_moves(num_objects)
         visited = (np.concatenate(part, axis=1) for part in zip(*places, strict=True))
         mixtures = fit_spare(targets, mixtures, *visited)
@@ -158,6 +155,19 @@ def sample_population(
         counts=counts,
         evidence=evidence,
     )
+
+
+def _can_change(counts: MoveCounts) -> np.ndarray:
+    """Objects that go on with changes, `[object]`, by what was accepted in warm-up.
+
+    Those where they are of use, or more so than jumps that change the structure.
+    """
+    change, jump = MOVES.index("change"), MOVES.index("jump")
+    proposed = counts.proposed[:, change].sum(axis=1)
+    accepted = counts.accepted[:, change].sum(axis=1)
+    is_frequent = accepted + 1 >= _LEAST_ACCEPTED * proposed
+    is_rare_elsewhere = accepted > counts.accepted[:, jump, 1]
+    return (is_frequent | is_rare_elsewhere) & (proposed > 0)
 
 
 def _arrange(kept: list[Point], settings: PopulationSettings) -> ChainDraws:

@@ -220,8 +220,7 @@ def sample_by_jumps(
         targets: stacked along a leading object axis.
         modes: fitted modes of every structure.
         settings: how much to draw.
-        evaluate: from targets, structures `[object, point]` and coordinates `[object,
-            point, dim]` to log-densities `[object, point]`.
+        evaluate: as `weighing.evaluate_each`.
 
     Returns:
         Draws of all chains; evidence by importance sampling, whose odds the visits of

@@ -102,8 +102,7 @@ def sample_tempered(
         targets: stacked along a leading object axis.
         modes: fitted modes of every structure.
         settings: how much to draw; as many particles as draws of all chains.
-        evaluate: from targets, structures `[object, point]` and coordinates `[object,
-            point, dim]` to log-densities `[object, point]`.
+        evaluate: as `weighing.evaluate_each`.
 
     Returns:
         Particles, with an island for a chain, and evidence from the islands.

@@ -52,7 +52,7 @@ def weigh(
         targets: stacked along a leading object axis.
         mixtures: one of each object.
         num_draws: of each object.
-        evaluate: log-densities of as many points of every object.
+        evaluate: as `evaluate_each`.
         is_asked: objects whose draws are weighed, `[object]`; None: all. Of the others
             nothing that is returned means anything.
     """
@@ -113,7 +113,7 @@ def evaluate_asked(
     z: Float[Array, "object point dim"],
     is_asked: np.ndarray | None,
 ) -> Float[Array, "object point"]:
-    """The same by any function, which knows of a choice where not all are asked."""
+    """The same by any such function, which is told of a choice where there is one."""
     if is_asked is None or np.all(is_asked):
         return evaluate(targets, structure, z)
     return evaluate(targets, structure, z, is_asked)
