@@ -72,7 +72,7 @@ def about_means(
     values: np.ndarray,
     group: np.ndarray,
     period: np.ndarray,
-    root: np.ndarray | None = None,
+    family: np.ndarray | None = None,
 ) -> Proposed:
     """Moves that would keep the normal density of each group's mean and covariance.
 
@@ -84,14 +84,14 @@ def about_means(
         values: where draws are, `[draw, number]`.
         group: of each, `[draw]`.
         period: of each number; zero: it has none.
-        root: which draw each was copied from, `[draw]`; None: none was copied.
+        family: which draw each was copied from, `[draw]`; None: none was copied.
     """
     out, log_ratio = values.copy(), np.zeros(len(values))
-    root = np.arange(len(values)) if root is None else root
+    family = np.arange(len(values)) if family is None else family
     for name in np.flatnonzero(are_enough(values, group)):
         rows = np.flatnonzero(group == name)
         used = _varied(values[rows])
-        dealt = _dealt(rng, root[rows])
+        dealt = _dealt(rng, family[rows])
         for part in range(_NUM_PARTS):
             mine = dealt == part
             own, others = rows[mine], values[rows[~mine]]
@@ -136,9 +136,9 @@ def from_means(values: np.ndarray, group: np.ndarray, period: np.ndarray) -> np.
     return out
 
 
-def _dealt(rng: np.random.Generator, root: np.ndarray) -> np.ndarray:
+def _dealt(rng: np.random.Generator, family: np.ndarray) -> np.ndarray:
     """Part of each draw: parts about equal, copies of one draw in the same."""
-    _, family, sizes = np.unique(root, return_inverse=True, return_counts=True)
+    _, family, sizes = np.unique(family, return_inverse=True, return_counts=True)
     part, filled = np.zeros(len(sizes), int), np.zeros(_NUM_PARTS)
     order = rng.permutation(len(sizes))
     # The largest families first, each where there is most room.

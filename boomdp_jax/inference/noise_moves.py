@@ -4,9 +4,9 @@ import numpy as np
 
 from boomdp_jax.inference.draw_moves import are_enough
 
-# Every so many moves are of the other kind, but where that is known to go less than
-# such a share as far.
-_EVERY, _CLOSE = 4, 0.3
+# Where moves go less far than this, every so many are of the other kind, but where that
+# is known to go less than such a share as far.
+_POOR, _EVERY, _CLOSE = 0.1, 4, 0.3
 
 
 class MoveKinds:
@@ -32,8 +32,9 @@ class MoveKinds:
         self._number += 1
         is_about_mean = self._reach[0] >= self._reach[1]
         if self._number % _EVERY == 0:
-            is_far_less = self._reach.min(axis=0) < _CLOSE * self._reach.max(axis=0)
-            is_tried = ~(is_far_less & np.all(self._is_known, axis=0))
+            less, more = self._reach.min(axis=0), self._reach.max(axis=0)
+            is_far_less = (less < _CLOSE * more) & np.all(self._is_known, axis=0)
+            is_tried = (more < _POOR) & ~is_far_less
             is_about_mean = is_about_mean ^ is_tried
         enough = are_enough(values, group)
         is_about_mean[len(enough) :] = False

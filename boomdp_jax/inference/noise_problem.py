@@ -50,6 +50,8 @@ class NoiseDraws(NamedTuple):
     """Of what a unit of volume in z becomes."""
     root: np.ndarray
     """Which draw it comes from."""
+    family: np.ndarray
+    """Which draw it was copied from since it moved about a mean."""
 
     @property
     def ratio(self) -> np.ndarray:
@@ -188,6 +190,9 @@ class NoiseProblem:
         dim = draws.z.shape[1]
         z, vector = proposed.values[:, :dim], proposed.values[:, dim:]
         trial = self._with_last(draws._replace(z=z, vector=vector))
+        alone = draws.family.max(initial=0) + 1 + np.arange(len(z))
+        is_far = is_about_mean[draws.group]
+        trial = trial._replace(family=np.where(is_far, alone, draws.family))
         first = np.zeros_like(trial.log_last)
         if np.any(power < 1.0):
             found = evaluate_points(self._targets, self._index, draws.structure, z)
@@ -207,7 +212,7 @@ class NoiseProblem:
         first = draws.value + self._proposal.log_density(vector, group)
         z = draws.z.astype(float)
         fresh = NoiseDraws(
-            draws.structure, z, z, vector, group, first, none, none, rows
+            draws.structure, z, z, vector, group, first, none, none, rows, rows
         )
         return self.only(rows)._with_last(fresh)
 
@@ -233,7 +238,7 @@ class NoiseProblem:
         near = by_differences(rng, values, group, period, num_moved, _STEP_SIZE)
         if not np.any(is_about_mean):
             return near
-        far = about_means(rng, values, group, period, draws.root)
+        far = about_means(rng, values, group, period, draws.family)
         return Proposed(
             np.where(is_about_mean[:, None], far.values, near.values),
             np.where(is_about_mean, far.log_ratio, near.log_ratio),
