@@ -96,8 +96,11 @@ def test_a_swing_tells_where_the_pin_is_and_nothing_of_the_mass():
         jax.random.key(0), pendulum([]), history, {"box": ["revolute"]}, settings=QUICK
     )
     contraction = dict(zip(found.names, found.contraction, strict=True))
-    # Nor of dry friction, where there is none to speak of.
-    assert set(found.insensitive) <= {"box.density", "box.revolute.dry_share"}
+    # That there is next to no friction may go for viscous or for dry friction, of which
+    # the other then tells nothing.
+    frictions = {"box.revolute.viscous_rate", "box.revolute.dry_share"}
+    assert set(found.insensitive) - frictions <= {"box.density"}
+    assert max(contraction[name] for name in frictions) > 0.3
     assert abs(contraction["box.density"]) < 0.05
     anchors = [value for name, value in contraction.items() if "anchor" in name]
     assert len(anchors) == 4
