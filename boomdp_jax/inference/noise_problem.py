@@ -191,7 +191,9 @@ class NoiseProblem:
         z, vector = proposed.values[:, :dim], proposed.values[:, dim:]
         trial = self._with_last(draws._replace(z=z, vector=vector))
         alone = draws.family.max(initial=0) + 1 + np.arange(len(z))
-        is_far = is_about_mean[draws.group]
+        # Draws for which there were too few others stay, and are copies still.
+        has_moved = np.any(proposed.values != draws.values, axis=1)
+        is_far = is_about_mean[draws.group] & has_moved
         trial = trial._replace(family=np.where(is_far, alone, draws.family))
         first = np.zeros_like(trial.log_last)
         if np.any(power < 1.0):
