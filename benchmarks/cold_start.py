@@ -151,7 +151,7 @@ def scenes(name: str) -> tuple[SceneSpec, SceneSpec]:
         bodies += [box("table", 3.0, 0.0, 0.5), box("cart", 0.0, 3.0), box("box", 3, 3)]
         constraints += [
             {"type": "revolute", "a": "table", "b": "world", "dry": 0.3}
-            | {"anchor_a": [0.1, 0.05], "anchor_b": [3.0, 0.2]},
+            | {"anchor_a": [0.1, 0.05], "anchor_b": [3.0638, 0.0918]},
             {"type": "wheel", "a": "cart", "pose": [-0.2, 0.0, 0.0]}
             | {"viscous": [1.0, 60.0]},
         ]

@@ -172,6 +172,7 @@ def coupled_substep(
         force,
         motion,
         final,
+        touches=touching(contacts, list(stage.sums)),
         # Smoothed contacts push before bodies touch.
         is_closed=contacts.smoothing is None,
     )

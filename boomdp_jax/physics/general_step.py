@@ -10,12 +10,20 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from boomdp_jax.core.holding import hold, runtime_one
+from boomdp_jax.physics.energy_limit import Doubts, limited_energy
 from boomdp_jax.physics.friction import Spin
-from boomdp_jax.physics.joints import Frames, bilateral_rows, join, of_body
+from boomdp_jax.physics.joints import (
+    Frames,
+    bilateral_rows,
+    join,
+    of_body,
+    on_bodies,
+)
 from boomdp_jax.physics.motion import Motion
 from boomdp_jax.physics.prepare import Drive, Prepared
 from boomdp_jax.physics.projection import drive_rows, mobility, project
 from boomdp_jax.physics.row_algebra import (
+    PerBody,
     PerRow,
     Tied,
     ease_of,
@@ -33,9 +41,6 @@ from boomdp_jax.physics.velocity_solve import Laws, Limits, VelocityProblem
 _MOST_CHANGE = 0.06
 # Turn [rad] of a body in a substep from which its joints and wheels are not right.
 _MOST_TURN = 0.4
-# More of its kinetic energy no substep adds to it out of nothing; where a linkage comes
-# close to a dead centre, it may come to a third.
-_MOST_GAIN = 0.005
 
 
 def velocity_problem(
@@ -113,10 +118,10 @@ def velocity_problem(
 
 def _steadied(
     prepared: Prepared, mid: Tied, ease: PerRow, end: Tied
-) -> tuple[Tied, Bool[Array, " lane"]]:
+) -> tuple[Tied, Bool[Array, "row lane"]]:
     """The rows at the end of the substep, or at mid-step where they turn too far.
 
-    And whether none does.
+    And which do not.
 
     Impulses act along one and joints hold along the other. As long as both are alike
     that is of second order; when they are not (a fast spin, a short rod) the system may
@@ -126,7 +131,7 @@ def _steadied(
     is_steady = change <= _MOST_CHANGE * ease
     chosen = per_row(is_steady, mid)
     steadied = with_arms(lambda new, old: jnp.where(chosen, new, old), end, mid)
-    return steadied, jnp.all(is_steady, axis=0)
+    return steadied, is_steady
 
 
 def _drives(
@@ -140,7 +145,7 @@ def _drives(
         for spin, target in ((drive.friction, None), (drive.motor, drive.target)):
             if spin is not None:
                 aim = jnp.zeros_like(moving) if target is None else target
-                laws.append(Laws(rows, Spin(*spin), moving, aim))
+                laws.append(Laws(rows, Spin(*spin), moving, aim, row.a))
         if drive.lower is not None:
             limits.append(_range(prepared, drive, rows, row.error, moving))
     return join(*laws), join(*limits)
@@ -192,15 +197,10 @@ def projected(
     start: Motion,
     end: Motion,
     *,
+    touches: PerBody | None = None,
     is_closed: bool = True,
 ) -> Motion:
     """The end of a substep on the joints, without energy that nothing brought.
-
-    Where bodies turn so far in a substep that the rows of their joints are not what
-    they were (`_steadied`), or come far off them, or where Newton's method has not come
-    to rest, or a contact kicks what joints hold, a step is wrong whatever it does.
-    Twists are then scaled down, which joints do not notice, to the kinetic energy at
-    the start and the work of forces and motors.
 
     Args:
         prepared: what does not depend on the state.
@@ -209,65 +209,51 @@ def projected(
         force: world frame, at the centres of mass [N, N, N m].
         start: of the substep.
         end: of the substep, close to what joints allow.
+        touches: share of contact in each body's motion; None: nothing touches.
         is_closed: whether nothing but forces and motors brings energy.
 
     Returns:
         The end.
     """
     end, is_far = project(prepared, end)
-    is_right = is_settled & ~is_far & ~_is_fast(prepared, problem, end)
+    is_wrong = is_far | _is_fast(prepared, problem, end)
     if problem.is_steady is not None:
-        is_right = is_right & problem.is_steady
-    half_mass = 0.5 * prepared.mobile * prepared.mass
-    half_inertia = 0.5 * prepared.mobile * prepared.inertia
-
-    def kinetic(motion: Motion):
-        linear = half_mass * (motion.vx**2 + motion.vy**2)
-        return jnp.sum(linear + half_inertia * motion.spin**2, axis=0)
-
-    length = prepared.length[None]
-    weight = [w / length for w in prepared.weight]
-    forces = (force[0] + weight[0], force[1] + weight[1], force[2])
-    work = sum(
-        jnp.sum(prepared.mobile * f * (new - old), axis=0)
-        for f, new, old in zip(forces, end[:3], start[:3], strict=True)
-    )
+        is_wrong = is_wrong | _of_rows(problem, ~problem.is_steady)
+    doubts = Doubts(is_settled, is_wrong, is_closed)
     motors = _motor_work(prepared, problem, end)
-    first, present = kinetic(start), kinetic(end)
-    allowed = jnp.maximum(first + work + motors, 0.0)
-    # Overlapping bodies may be moved up without being paid for it.
-    most = first + jnp.maximum(work, 0.0) + motors
-    is_kicked = is_closed & (present > (1.0 + _MOST_GAIN) * most)
-    allowed = jnp.where(is_right, most, allowed)
-    is_much = (~is_right | is_kicked) & (present > allowed)
-    ratio = allowed / jnp.where(is_much, present, 1.0)
-    # No derivative of the root of nothing.
-    has_ratio = is_much & (ratio > 0.0)
-    root = jnp.sqrt(jnp.where(has_ratio, ratio, 1.0))
-    scale = jnp.where(is_much, jnp.where(has_ratio, root, 0.0), 1.0)[None]
-    return end._replace(vx=scale * end.vx, vy=scale * end.vy, spin=scale * end.spin)
+    return limited_energy(prepared, start, end, force, motors, touches, doubts)
+
+
+def _of_rows(
+    problem: VelocityProblem, is_so: Bool[Array, "row lane"]
+) -> Bool[Array, "body lane"]:
+    """Bodies with a joint row of which something holds: the first of each row's two."""
+    rows: Any = problem.rows_mid
+    return on_bodies(rows.a, is_so, problem.mass.shape[0]) > 0.0
 
 
 def _is_fast(
     prepared: Prepared, problem: VelocityProblem, end: Motion
-) -> Bool[Array, " lane"]:
-    """Whether a body with a joint or friction ends up turning too far in a substep."""
+) -> Bool[Array, "body lane"]:
+    """Which bodies with a joint or friction end up turning too far in a substep."""
     turned = prepared.length[None] * jnp.abs(jax.lax.stop_gradient(end.spin))
-    is_fast = jnp.zeros(turned.shape[-1:], bool)
+    is_fast = jnp.zeros(turned.shape, bool)
     if problem.contacts is not None:
         rubs = jnp.any(problem.contacts.viscous[0] > 0.0, axis=0)
         rubs = rubs | jnp.any(problem.contacts.viscous[1] > 0.0, axis=0)
-        is_fast = is_fast | jnp.any(rubs & (turned > _MOST_TURN), axis=0)
+        is_fast = rubs & (turned > _MOST_TURN)
     rows: Any = problem.rows_mid
     if rows is not None:
         ease: Any = problem.ease
         most = jnp.maximum(of_body(rows.a, turned), of_body(rows.b, turned))
-        is_fast = is_fast | jnp.any((most > _MOST_TURN) & (ease > 0.0), axis=0)
+        is_fast = is_fast | _of_rows(problem, (most > _MOST_TURN) & (ease > 0.0))
     return is_fast
 
 
-def _motor_work(prepared: Prepared, problem: VelocityProblem, end: Motion):
-    """Most that motors can have done."""
+def _motor_work(
+    prepared: Prepared, problem: VelocityProblem, end: Motion
+) -> PerBody | float:
+    """Most that motors can have done, by the first of the bodies that each turns."""
     laws = problem.laws
     if laws is None:
         return 0.0
@@ -281,7 +267,7 @@ def _motor_work(prepared: Prepared, problem: VelocityProblem, end: Motion):
     spin, has_motor = laws.friction, laws.target != 0.0
     knee = jnp.where(spin.knee > 0.0, spin.knee, 1.0)
     strength = jnp.where(has_motor & (spin.knee > 0.0), spin.viscous / knee, 0.0)
-    return jnp.sum(strength * fastest, axis=0)
+    return on_bodies(laws.body, strength * fastest, prepared.mass.shape[0])
 
 
 def moved_by(prepared: Prepared, motion: Motion, twist: tuple) -> Motion:

@@ -160,6 +160,19 @@ def of_body(index: PerRow, values: Any) -> Any:
     return jax.tree.unflatten(treedef, list(total))
 
 
+def on_bodies(index: PerRow, values: Any, num_bodies: int) -> PerBody:
+    """What rows say of the bodies that an index names, added up.
+
+    Args:
+        index: of a body of each row.
+        values: of each row, numbers or truth values.
+        num_bodies: how many there are.
+    """
+    body = jnp.arange(num_bodies, dtype=index.dtype)[None, :, None]
+    is_it = index[:, None] == body
+    return jnp.sum(jnp.where(is_it, jnp.asarray(values, index.dtype)[:, None], 0.0), 0)
+
+
 def bilateral_rows(joints: Joints, frames: Frames) -> Rows | None:
     """All rows that hold in both directions.
 

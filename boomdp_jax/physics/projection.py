@@ -17,6 +17,7 @@ from boomdp_jax.physics.joints import (
     Rows,
     bilateral_rows,
     join,
+    on_bodies,
     slide_rows,
     turn_rows,
 )
@@ -85,7 +86,9 @@ def drive_rows(prepared: Prepared, frames: Frames) -> list[tuple[Drive, Rows]]:
     return pairs
 
 
-def project(prepared: Prepared, motion: Motion) -> tuple[Motion, Bool[Array, " lane"]]:
+def project(
+    prepared: Prepared, motion: Motion
+) -> tuple[Motion, Bool[Array, "body lane"]]:
     """Bring poses, then twists, back onto the joints and into their ranges.
 
     Args:
@@ -93,11 +96,12 @@ def project(prepared: Prepared, motion: Motion) -> tuple[Motion, Bool[Array, " l
         motion: close to what joints allow.
 
     Returns:
-        The closest motion, in kinetic energy, to first order; and whether it was far.
+        The closest motion, in kinetic energy, to first order; and bodies with a joint
+        that was far, the first of its two.
     """
     one = runtime_one(prepared.mass)
     if not has_rows(prepared):
-        return motion, jnp.zeros(motion.x.shape[-1], bool)
+        return motion, jnp.zeros(motion.x.shape, bool)
     place, (_, is_far) = searched(_put_nearer, _put_again, (prepared, motion[:3]), ())
     motion = jax.tree.map(lambda v: hold(v, one), Motion(*place, *motion[3:]))
     rows, counts = _rows(prepared, frames_of(prepared, motion), tuple(motion[3:]))
@@ -132,10 +136,12 @@ def _put_nearer(problem: tuple, given: tuple) -> tuple:
             )
         )
         was_far = jnp.where(turn == 0, is_far, was_far)
-        return turn + 1, new, shift, was_far, is_open & is_far
+        is_open = is_open & jnp.any(is_far, axis=0)
+        return turn + 1, new, shift, was_far, is_open
 
     zero, every = jnp.zeros_like(first[0]), jnp.ones(first[0].shape[-1], bool)
-    start = (jnp.zeros((), jnp.int32), first, (zero, zero, zero), ~every, every)
+    none = jnp.zeros(first[0].shape, bool)
+    start = (jnp.zeros((), jnp.int32), first, (zero, zero, zero), none, every)
     _, place, shift, is_far, _ = jax.lax.while_loop(goes_on, advance, start)
     return place, (shift, is_far)
 
@@ -151,10 +157,10 @@ def _put_again(problem: tuple, place: tuple, rest: tuple) -> tuple:
     return _nearer(prepared, tuple(p + q for p, q in zip(first, shift, strict=True)))[0]
 
 
-def _nearer(prepared: Prepared, place: tuple) -> tuple[tuple, Bool[Array, " lane"]]:
+def _nearer(prepared: Prepared, place: tuple) -> tuple[tuple, Bool[Array, "body lane"]]:
     """One linear correction of poses, in which no body turns too far.
 
-    And whether they were far.
+    And the first bodies of rows that were far.
     """
     zero = jnp.zeros_like(place[0])
     motion = Motion(*place, zero, zero, zero)
@@ -162,7 +168,8 @@ def _nearer(prepared: Prepared, place: tuple) -> tuple[tuple, Bool[Array, " lane
     assert rows is not None
     assert counts is not None
     lever = jnp.abs(rows.ja[2]) + jnp.abs(rows.jb[2]) + _LEAST_LEVER
-    is_far = jnp.any(jnp.abs(counts * rows.error) > _FAR * lever, axis=0)
+    is_far_row = jnp.abs(counts * rows.error) > _FAR * lever
+    is_far = on_bodies(rows.a, is_far_row, zero.shape[0]) > 0.0
     change = _corrected(prepared, rows, counts, rows.error, (zero, zero, zero))
     turn = jnp.max(jnp.abs(change[2]), axis=0)
     is_wide = turn > _MOST_TURN

@@ -10,7 +10,7 @@ A substep of length h, for every body at once:
 
 Substeps that turn bodies too far, linkages close to a dead centre and impacts with
 friction can come out with more energy than they had; what nothing brought is taken away
-again (`general_step.projected`, `contact_energy`).
+again (`energy_limit`, `contact_energy`).
 
 Second order for smooth motion; a single contact's viscous decay, its response to a
 constant force and dry sliding in a straight line are exact. Where a contact changes

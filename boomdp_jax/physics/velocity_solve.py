@@ -62,6 +62,8 @@ class Laws(NamedTuple):
     """Speed at the start of the substep."""
     target: PerRow
     """Speed that it drives at, zero for friction."""
+    body: PerRow
+    """Index of one of the bodies that it acts on."""
 
 
 class Limits(NamedTuple):
@@ -102,8 +104,9 @@ class VelocityProblem(NamedTuple):
     """Of joints alone."""
     ease: PerRow | None
     """J M^-1 J^T of each row of joints, zero for inactive ones."""
-    is_steady: Bool[Array, " lane"] | None
-    """Whether no row turns so far in this substep that it is taken at mid-step."""
+    is_steady: Bool[Array, "row lane"] | None
+    """Whether a row of joints does not turn so far in this substep that it is taken at
+    mid-step."""
     laws: Laws | None
     limits: Limits | None
 

@@ -1,0 +1,167 @@
+"""No energy out of nothing, island by island.
+
+Where bodies turn so far in a substep that the rows of their joints are not what they
+were, or come far off them, or where Newton's method has not come to rest, or a contact
+kicks what joints hold, a step is wrong whatever it does. Twists are then scaled down,
+which joints do not notice, to the kinetic energy at the start and the work of forces
+and motors. Bodies that nothing joins have nothing to do with it: an island is what
+joints tie together, and all bodies in contact, since impulses of contacts bring energy
+from one to the other.
+
+All arrays are in lanes (`core.lanes`).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from boomdp_jax.physics.joints import Ends, of_body
+from boomdp_jax.physics.motion import Motion
+from boomdp_jax.physics.prepare import Prepared
+
+# More of its kinetic energy no substep adds to an island out of nothing; where a
+# linkage comes close to a dead centre, it may come to a third.
+_MOST_GAIN = 0.005
+
+PerBody = Float[Array, "body lane"]
+
+
+class Doubts(NamedTuple):
+    """Where a substep cannot be right."""
+
+    is_settled: Bool[Array, " lane"]
+    """Whether Newton's method came to rest."""
+    is_wrong: Bool[Array, "body lane"]
+    """Bodies with joints or friction that turned or went too far."""
+    is_closed: bool
+    """Whether nothing but forces and motors brings energy."""
+
+
+def limited_energy(
+    prepared: Prepared,
+    start: Motion,
+    end: Motion,
+    force: tuple,
+    motors: PerBody | float,
+    touches: PerBody | None,
+    doubts: Doubts,
+) -> Motion:
+    """The end of a substep without energy that nothing brought.
+
+    Args:
+        prepared: what does not depend on the state.
+        start: of the substep.
+        end: of the substep.
+        force: world frame, at the centres of mass [N, N, N m].
+        motors: most work that motors can have done, by either of their bodies.
+        touches: share of contact in a body's motion; None: nothing touches.
+        doubts: about this substep.
+
+    Returns:
+        The end, with twists scaled down where needed.
+    """
+    half_mass = 0.5 * prepared.mobile * prepared.mass
+    half_inertia = 0.5 * prepared.mobile * prepared.inertia
+
+    def kinetic(motion: Motion) -> PerBody:
+        linear = half_mass * (motion.vx**2 + motion.vy**2)
+        return linear + half_inertia * motion.spin**2
+
+    length = prepared.length[None]
+    weight = [w / length for w in prepared.weight]
+    forces = (force[0] + weight[0], force[1] + weight[1], force[2])
+    work = sum(
+        prepared.mobile * f * (new - old)
+        for f, new, old in zip(forces, end[:3], start[:3], strict=True)
+    )
+    is_right = ~doubts.is_wrong & doubts.is_settled[None]
+    first, present = kinetic(start), kinetic(end)
+    motors = jnp.broadcast_to(motors, first.shape)
+    first, present, work, motors, num_wrong = _over_islands(
+        islands(prepared, touches),
+        (first, present, work, motors, (~is_right).astype(first.dtype)),
+    )
+    is_right = num_wrong == 0.0
+    allowed = jnp.maximum(first + work + motors, 0.0)
+    # Overlapping bodies may be moved up without being paid for it.
+    most = first + jnp.maximum(work, 0.0) + motors
+    is_kicked = doubts.is_closed & (present > (1.0 + _MOST_GAIN) * most)
+    allowed = jnp.where(is_right, most, allowed)
+    is_much = (~is_right | is_kicked) & (present > allowed)
+    ratio = allowed / jnp.where(is_much, present, 1.0)
+    # No derivative of the root of nothing.
+    has_ratio = is_much & (ratio > 0.0)
+    root = jnp.sqrt(jnp.where(has_ratio, ratio, 1.0))
+    scale = jnp.where(is_much, jnp.where(has_ratio, root, 0.0), 1.0)
+    return end._replace(vx=scale * end.vx, vy=scale * end.vy, spin=scale * end.spin)
+
+
+def islands(prepared: Prepared, touches: PerBody | None) -> PerBody | None:
+    """A name of each body's island; None where there is a single body.
+
+    Args:
+        prepared: joints, and which bodies are held fast, which join nothing.
+        touches: bodies of which this is not zero are one island.
+    """
+    num_bodies = prepared.mass.shape[0]
+    if num_bodies == 1:
+        return None
+    mobile = jax.lax.stop_gradient(prepared.mobile)
+    own = jnp.arange(1, num_bodies + 1, dtype=mobile.dtype)[:, None]
+    name = jnp.broadcast_to(own, mobile.shape)
+    if touches is not None:
+        name = jnp.where(touches != 0.0, 0.0, name)
+    joints = prepared.joints
+    slots = [
+        _Link(ends.a, ends.b, ends.has_b * ends.on * _both(ends, mobile))
+        for ends in (joints.points, joints.rods, joints.angles)
+        if ends is not None
+    ]
+    if not slots:
+        return name
+    links = jax.lax.stop_gradient(
+        _Link(*(jnp.concatenate(parts) for parts in zip(*slots, strict=True)))
+    )
+    if num_bodies == 2:
+        return _spread(links, name)
+
+    def goes_on(carry):
+        return carry[1]
+
+    def again(carry):
+        new = _spread(links, carry[0])
+        return new, jnp.any(new != carry[0])
+
+    return jax.lax.while_loop(goes_on, again, (name, jnp.asarray(True)))[0]
+
+
+class _Link(NamedTuple):
+    """Of each slot which bodies it ties, and one where it does, else zero."""
+
+    a: Float[Array, "slot lane"]
+    b: Float[Array, "slot lane"]
+    on: Float[Array, "slot lane"]
+
+
+def _both(ends: Ends, mobile: PerBody) -> Float[Array, "slot lane"]:
+    return of_body(ends.a, mobile) * of_body(ends.b, mobile)
+
+
+def _spread(links: _Link, name: PerBody) -> PerBody:
+    """Both bodies of a link get the lesser name."""
+    least = jnp.minimum(of_body(links.a, name), of_body(links.b, name))
+    beyond = float(name.shape[0] + 1)
+    least = jnp.where(links.on > 0.0, least, beyond)[:, None]
+    body = jnp.arange(name.shape[0], dtype=name.dtype)[None, :, None]
+    is_end = (links.a[:, None] == body) | (links.b[:, None] == body)
+    return jnp.minimum(name, jnp.min(jnp.where(is_end, least, beyond), axis=0))
+
+
+def _over_islands(name: PerBody | None, values: tuple) -> tuple:
+    """Of each body what its island has in all."""
+    if name is None:
+        return values
+    is_same = (name[:, None] == name[None]).astype(values[0].dtype)
+    return tuple(jnp.sum(is_same * value[None], axis=1) for value in values)
