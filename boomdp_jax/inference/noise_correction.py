@@ -29,18 +29,12 @@ from boomdp_jax.inference.fit_noise import NoiseDensity
 from boomdp_jax.inference.lineages import worth_of_draws
 from boomdp_jax.inference.noise_level import NoiseFit
 from boomdp_jax.inference.noise_moves import MoveKinds
-from boomdp_jax.inference.noise_problem import (
-    NoiseDraws,
-    NoiseProblem,
-    effective_size,
-)
+from boomdp_jax.inference.noise_problem import NoiseDraws, NoiseProblem
 from boomdp_jax.inference.noise_proposal import NoiseProposal, best_of_groups, groups_of
-from boomdp_jax.inference.resampling import systematic
+from boomdp_jax.inference.noise_steps import first_step, further_step
 from boomdp_jax.inference.structure_evidence import StructureEvidence, reweighed
 from boomdp_jax.inference.target import StructureTarget
-from boomdp_jax.inference.tempered_smc import next_step, times
 
-_KEPT_SHARE = 0.5
 _MAX_STEPS = 20
 _MOVES_BETWEEN, _LAST_MOVES = 1, 2
 # Where the first weights count for this share of the draws one move will do.
@@ -92,7 +86,7 @@ def infer_noise(
     Returns:
         As many draws, in chains that never exchange any.
     """
-    num_objects, num_chains, num_each = structure.shape
+    num_objects, num_chains, _ = structure.shape
     index = np.repeat(np.arange(num_objects), structure[0].size)
     problem, draws = NoiseProblem.start(
         rng, targets, index, _as_fits(index, structure, z, log_density), start
@@ -102,22 +96,16 @@ def infer_noise(
     before = draws.structure
     first_size = np.zeros(num_objects)
     kinds = MoveKinds(problem.num_groups)
-    while np.any(power < 1.0) and steps < _MAX_STEPS:
-        ratio = draws.ratio.reshape(num_objects, -1)
-        step = np.array(
-            [
-                next_step(r, 1.0 - b, _KEPT_SHARE)
-                for r, b in zip(ratio, power, strict=True)
-            ]
-        )
-        if steps == 0:
-            first_size = np.array([effective_size(each) for each in ratio])
-        log_weight = times(step[:, None], ratio).reshape(num_objects, num_chains, -1)
+    while steps == 0 or (np.any(power < 1.0) and steps < _MAX_STEPS):
         is_under_way = power < 1.0
-        log_mean = np.logaddexp.reduce(log_weight, axis=-1) - np.log(num_each)
-        log_share += np.where(is_under_way[:, None], log_mean, 0.0)
-        power = np.where(step >= 1.0 - power, 1.0, power + step)
-        draws = draws.take(_resample(rng, log_weight, is_under_way))
+        if steps == 0:
+            found = first_step(rng, problem, draws, index, num_chains)
+            first_size = found.size
+        else:
+            found = further_step(rng, draws, power, num_chains)
+        draws = found.draws
+        log_share += found.log_mean
+        power = np.where(found.step >= 1.0 - power, 1.0, power + found.step)
         steps += 1
         is_easy = (steps == 1) & (first_size > _GOOD_SHARE * structure[0].size)
         num_moves = np.where((power >= 1.0) & ~is_easy, _LAST_MOVES, _MOVES_BETWEEN)
@@ -266,27 +254,3 @@ def _moved(
     for whole, part in zip(joined, after, strict=True):
         whole[rows] = part
     return NoiseDraws(*joined)
-
-
-def _resample(
-    rng: np.random.Generator, log_weight: np.ndarray, is_asked: np.ndarray
-) -> np.ndarray:
-    """Rows of the chosen draws, chain by chain, in random order.
-
-    Args:
-        rng: source of randomness.
-        log_weight: `[object, chain, draw]`.
-        is_asked: objects of which any are chosen; the others keep all of theirs.
-    """
-    num_objects, num_chains, num = log_weight.shape
-    top = log_weight.max(axis=-1, keepdims=True)
-    is_lost = ~np.isfinite(top)
-    weight = np.where(is_lost, 1.0, np.exp(log_weight - np.where(is_lost, 0.0, top)))
-    rows = []
-    for i, c in np.ndindex(num_objects, num_chains):
-        begin = (i * num_chains + c) * num
-        if not is_asked[i]:
-            rows.append(begin + np.arange(num))
-            continue
-        rows.append(begin + rng.permutation(systematic(rng, weight[i, c], num)))
-    return np.concatenate(rows)

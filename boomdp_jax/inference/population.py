@@ -61,7 +61,7 @@ class PopulationSettings(NamedTuple):
     """Sweeps that are kept; each gives one draw per walker."""
     num_importance: int = 2048
     """Draws of each round that adapts the mixture; the last ones are the evidence."""
-    max_doublings: int = 2
+    max_doublings: int = 4
     """How often the number of sweeps of an object may double, of which then every
     second is kept, where its chains do not agree yet."""
 

@@ -22,10 +22,10 @@ def scene_of(**fields):
     )
 
 
-def block(time_step=0.02, **fields):
+def block(**fields):
     spec = scene_of(**fields)
     state = np.zeros((3, 1, 6))
-    return make_block(spec, (0,), make_history(state, state[..., :3], state, time_step))
+    return make_block(spec, (0,), make_history(state, state[..., :3], state, 0.02))
 
 
 def decode(b, z, active=True):
@@ -107,10 +107,18 @@ def test_random_coordinates_give_finite_positive_params():
     assert np.all(params.wheel.viscous[..., 0] < params.wheel.viscous[..., 1])
 
 
-@pytest.mark.parametrize(("time_step", "whole"), [(0.02, True), (0.4, False)])
-def test_long_steps_are_cut_as_the_engine_cuts_them(time_step, whole):
-    # By the recording's steps; the scene's own is 0.02 s in both cases.
-    b, num = block(time_step), scene_of().scene.num_substeps
+@pytest.mark.parametrize(
+    ("time_step", "names", "whole"),
+    [(0.02, "b", False), (0.4, "b", False), (0.02, "bc", True), (0.4, "bc", False)],
+)
+def test_steps_are_cut_as_the_engine_cuts_them(time_step, names, whole):
+    shape = {"type": "box", "half_extents": [0.2, 0.1]}
+    spec = scene_of(bodies=[{"name": name, "shape": shape} for name in names])
+    num, num_bodies = spec.scene.num_substeps, len(names)
     assert num > 1
+    # By the recording's steps; the scene's own is 0.02 s in all cases.
+    state = np.zeros((3, num_bodies, 6))
+    history = make_history(state, state[..., :3], state, time_step)
+    b = make_block(spec, tuple(range(num_bodies)), history)
     scene = b.target.log_likelihood.coordinates.scene
     assert scene.num_substeps == (1 if whole else num)

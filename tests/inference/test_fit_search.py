@@ -15,7 +15,7 @@ from tests.inference.prior_objects import draw_tracks
 @pytest.fixture(scope="module")
 def few():
     """Four objects, and a fit of every structure of each: with nothing known."""
-    targets = draw_tracks(np.random.default_rng(3), 4, 20).targets
+    targets = draw_tracks(np.random.default_rng(4), 4, 20).targets
     num = targets.structures.shape[1]
     index, structure = np.repeat(np.arange(4), num), np.tile(np.arange(num), 4)
     z = np.zeros((len(index), targets.slot.shape[-1]))

@@ -1,0 +1,129 @@
+"""Resampling on the way from fixed gains to noise of their own (`noise_correction`).
+
+The first step is the hardest: coordinates and noise were drawn on their own, and of an
+object whose posterior bends few pairs may be any good. Where that is so each draw is
+given more noises, until what all of them count for is enough, and the first resampling
+chooses among all: moves could part the copies of a few later only slowly.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from boomdp_jax.inference.noise_problem import (
+    NoiseDraws,
+    NoiseProblem,
+    effective_size,
+)
+from boomdp_jax.inference.resampling import systematic
+from boomdp_jax.inference.tempered_smc import next_step, times
+
+# Share of the draws that weights of a step count for.
+_KEPT_SHARE = 0.5
+# Draws are given more noises until the first weights count for this share of them, at
+# most so many each.
+_ENOUGH_SHARE, _MOST_NOISES = 0.25, 8
+
+
+class Resampled(NamedTuple):
+    """What a step does."""
+
+    draws: NoiseDraws
+    """As many as before, of equal weight; those of objects that have arrived stay."""
+    step: np.ndarray
+    """By how much the power grew, `[object]`."""
+    log_mean: np.ndarray
+    """Of the weights of each chain, `[object, chain]`; zero where nothing was done."""
+    size: np.ndarray
+    """Draws that the last density over the one before counts for, `[object]`."""
+
+
+def first_step(
+    rng: np.random.Generator,
+    problem: NoiseProblem,
+    draws: NoiseDraws,
+    index: np.ndarray,
+    num_chains: int,
+) -> Resampled:
+    """Resample for the first time, giving draws more noises where few are any good.
+
+    Args:
+        rng: source of randomness.
+        problem: of the draws.
+        draws: the list, each with one noise.
+        index: object of each draw, as many of each.
+        num_chains: of each object, one after the other in the list.
+    """
+    num_objects = index[-1] + 1
+    num_draws = len(index) // num_objects
+    # Of each object its draws with every noise.
+    pools = [[draws.take(index == i)] for i in range(num_objects)]
+    size = np.array([effective_size(pool[0].ratio) for pool in pools])
+    for number in range(1, _MOST_NOISES):
+        asked = np.flatnonzero(size < _ENOUGH_SHARE * num_draws)
+        if not asked.size:
+            break
+        rows = np.flatnonzero(np.isin(index, asked))
+        names = number * len(index) + rows
+        more = problem.only(rows).with_other_noise(rng, draws.take(rows), names)
+        for i in asked:
+            pools[i].append(more.take(index[rows] == i))
+            size[i] = effective_size(np.concatenate([p.ratio for p in pools[i]]))
+    chosen, steps, log_means = [], [], []
+    for pool in pools:
+        # Chain after chain, each with all of its noises.
+        ratio = np.stack([part.ratio.reshape(num_chains, -1) for part in pool], axis=1)
+        step = next_step(ratio.ravel(), 1.0, _KEPT_SHARE / len(pool))
+        num_each = num_draws // num_chains
+        log_weight = times(step, ratio).reshape(num_chains, -1)
+        places = _places(rng, log_weight, num_each)
+        noise, place = np.divmod(places, num_each)
+        place = place + num_each * np.arange(num_chains)[:, None]
+        joined = NoiseDraws(*map(np.concatenate, zip(*pool, strict=True)))
+        chosen.append(joined.take((num_draws * noise + place).ravel()))
+        steps.append(step)
+        log_means.append(_log_mean(log_weight))
+    return Resampled(
+        NoiseDraws(*map(np.concatenate, zip(*chosen, strict=True))),
+        np.array(steps),
+        np.array(log_means),
+        size,
+    )
+
+
+def further_step(
+    rng: np.random.Generator, draws: NoiseDraws, power: np.ndarray, num_chains: int
+) -> Resampled:
+    """Resample the draws of objects that are on their way.
+
+    Args:
+        rng: source of randomness.
+        draws: the list.
+        power: how far from the first density to the last, `[object]`.
+        num_chains: of each object.
+    """
+    ratio = draws.ratio.reshape(len(power), num_chains, -1)
+    num_each = ratio.shape[-1]
+    steps, log_mean = np.zeros(len(power)), np.zeros(ratio.shape[:2])
+    rows = np.arange(ratio.size).reshape(ratio.shape)
+    for i in np.flatnonzero(power < 1.0):
+        steps[i] = next_step(ratio[i].ravel(), 1.0 - power[i], _KEPT_SHARE)
+        log_weight = times(steps[i], ratio[i])
+        log_mean[i] = _log_mean(log_weight)
+        places = _places(rng, log_weight, num_each)
+        rows[i] = np.take_along_axis(rows[i], places, axis=1)
+    size = np.array([effective_size(each.ravel()) for each in ratio])
+    return Resampled(draws.take(rows.ravel()), steps, log_mean, size)
+
+
+def _log_mean(log_weight: np.ndarray) -> np.ndarray:
+    """Of the weights of each chain, `[chain]`."""
+    return np.logaddexp.reduce(log_weight, axis=-1) - np.log(log_weight.shape[-1])
+
+
+def _places(rng: np.random.Generator, log_weight: np.ndarray, num: int) -> np.ndarray:
+    """So many places for each chain, in random order, `[chain, place]`."""
+    top = log_weight.max(axis=-1, keepdims=True)
+    is_lost = ~np.isfinite(top)
+    weight = np.where(is_lost, 1.0, np.exp(log_weight - np.where(is_lost, 0.0, top)))
+    return np.stack([rng.permutation(systematic(rng, w, num)) for w in weight])
