@@ -54,7 +54,7 @@ def first_step(
         index: object of each draw, as many of each.
         num_chains: of each object, one after the other in the list.
     """
-    num_objects = index[-1] + 1
+    num_objects = int(index[-1]) + 1
     num_draws = len(index) // num_objects
     # Of each object its draws with every noise.
     pools = [[draws.take(index == i)] for i in range(num_objects)]
