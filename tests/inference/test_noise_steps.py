@@ -1,0 +1,114 @@
+"""The first resampling of draws with noise, on normal densities with known answers."""
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from boomdp_jax.inference.noise_problem import (
+    NoiseDraws,
+    NoiseProblem,
+    effective_size,
+)
+from boomdp_jax.inference.noise_steps import first_step, further_step
+
+NUM_CHAINS, NUM_EACH = 4, 2048
+MIDDLE, SD, LOG_WHOLE = 2.0, 0.4, 3.0
+"""Of the noise in the last density, and what that integrates to. Against a standard
+normal one, one draw in nine counts."""
+
+
+class Normal(NoiseProblem):
+    """Coordinates and noise are standard normal at first; noise is moved and narrowed.
+
+    The second object's noise stays as it is.
+    """
+
+    def __init__(self, index):
+        self.index = index
+
+    def only(self, rows):
+        return Normal(self.index[rows])
+
+    def with_other_noise(self, rng, draws, names):
+        vector = rng.standard_normal(draws.vector.shape)
+        return self.of(draws.z, vector, names)
+
+    def of(self, z, vector, names):
+        first = norm.logpdf(z[:, 0]) + norm.logpdf(vector[:, 0])
+        moved = norm.logpdf(vector[:, 0], MIDDLE, SD) + LOG_WHOLE
+        last = np.where(self.index == 0, moved, norm.logpdf(vector[:, 0]))
+        last = last + norm.logpdf(z[:, 0])
+        none = np.zeros(len(z))
+        structure = self.index
+        return NoiseDraws(
+            structure, z, z, vector, structure, first, last, none, names, names
+        )
+
+
+@pytest.fixture(scope="module")
+def stepped():
+    rng = np.random.default_rng(0)
+    index = np.repeat([0, 1], NUM_CHAINS * NUM_EACH)
+    problem = Normal(index)
+    z = rng.standard_normal((len(index), 1))
+    draws = problem.of(z, rng.standard_normal(z.shape), np.arange(len(index)))
+    return draws, first_step(rng, problem, draws, index, NUM_CHAINS)
+
+
+def test_draws_get_more_noises_where_few_are_any_good(stepped):
+    draws, found = stepped
+    num = NUM_CHAINS * NUM_EACH
+    assert effective_size(draws.ratio[:num]) < 0.25 * num
+    assert found.size[0] > 0.25 * num
+    assert found.size[1] == pytest.approx(num)
+    # The names of the second object's draws are those that they had, each once.
+    np.testing.assert_array_equal(np.sort(found.draws.root[num:]), draws.root[num:])
+    assert len(np.unique(found.draws.root[:num])) > 0.2 * num
+
+
+def test_they_follow_the_density_on_the_way_and_their_mean_weight_is_its_whole(stepped):
+    _, found = stepped
+    num, share = NUM_CHAINS * NUM_EACH, found.step[0]
+    assert 0.3 < share < 1.0
+    grid = np.linspace(-8.0, 8.0, 20_001)
+    log_last = norm.logpdf(grid, MIDDLE, SD) + LOG_WHOLE
+    density = np.exp((1.0 - share) * norm.logpdf(grid) + share * log_last)
+    whole = density.sum() * (grid[1] - grid[0])
+    density = density / density.sum()
+    mean = density @ grid
+    sd = np.sqrt(density @ (grid - mean) ** 2)
+    # Weights of a step count for half of the draws.
+    error = 4.0 / np.sqrt(0.5 * num)
+    vector = found.draws.vector[:num, 0]
+    assert np.mean(vector) == pytest.approx(mean, abs=sd * error)
+    assert np.std(vector) == pytest.approx(sd, rel=error)
+    assert np.std(found.draws.z[:num]) == pytest.approx(1.0, rel=error)
+    evidence = np.exp(found.log_mean).mean(axis=1)
+    assert evidence[0] == pytest.approx(whole, rel=error)
+    assert found.step[1] == pytest.approx(1.0)
+    assert evidence[1] == pytest.approx(1.0)
+
+
+def test_chains_choose_among_their_own_draws(stepped):
+    draws, found = stepped
+    chain = np.arange(len(draws.root)) // NUM_EACH
+    np.testing.assert_array_equal(found.draws.root % len(chain) // NUM_EACH, chain)
+    # A draw's coordinates are those of its root, whatever its noise.
+    where = found.draws.root % len(chain)
+    np.testing.assert_array_equal(found.draws.z, draws.z[where])
+    has_own = found.draws.root < len(chain)
+    np.testing.assert_array_equal(
+        found.draws.vector[has_own], draws.vector[where[has_own]]
+    )
+
+
+def test_objects_that_have_arrived_stay(stepped):
+    draws, _ = stepped
+    rng = np.random.default_rng(1)
+    found = further_step(rng, draws, np.array([0.5, 1.0]), NUM_CHAINS)
+    num = NUM_CHAINS * NUM_EACH
+    np.testing.assert_array_equal(found.draws.root[num:], draws.root[num:])
+    assert len(np.unique(found.draws.root[:num])) < num
+    assert found.step[0] > 0.0
+    np.testing.assert_array_equal(found.step[1], 0.0)
+    np.testing.assert_array_equal(found.log_mean[1], 0.0)
