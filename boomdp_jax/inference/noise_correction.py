@@ -14,7 +14,9 @@ marginal likelihood of the extended filter that uses $\eta$. Each step keeps the
 effective sample size of its weights at a given share, resamples, and moves coordinates
 and noise of every draw by Metropolis steps within its structure (Del Moral, Doucet and
 Jasra 2006, Sequential Monte Carlo samplers). Where the fixed gains were right that is
-one step. Structures change their probability by the mean weight of their draws.
+one step; where they were far off the first one chooses among several noises for each
+draw (`noise_steps`). Structures change their probability by the mean weight of their
+draws.
 
 Where few lineages are left, their draws are moved on until they are worth enough
 independent ones (`lineages`).

@@ -158,7 +158,7 @@ def test_posterior_of_noise_is_that_of_differential_evolution(problem):
     x = np.concatenate([draws.z[:num][:, in_use], vector], axis=1)
     dim = x.shape[1]
     value, seen, fixed = log_density(x), [], None
-    for number in range(3000):
+    for number in range(8000):
         if number in (200, 400):
             late = np.concatenate(seen[-100:])
             fixed = multivariate_t(late.mean(0), np.cov(late.T), df=5, seed=number)
@@ -175,7 +175,7 @@ def test_posterior_of_noise_is_that_of_differential_evolution(problem):
         x = np.where(is_taken[:, None], trial, x)
         value = np.where(is_taken, new, value)
         seen.append(x)
-    halves = np.array(seen)[1000:].reshape(2, -1, dim)
+    halves = np.array(seen)[2000:].reshape(2, -1, dim)
     mean, sd = halves.mean(axis=(0, 1)), halves.std(axis=(0, 1))
     # What it is compared with has to be known first.
     drift = (halves[0].mean(axis=0) - halves[1].mean(axis=0)) / sd
