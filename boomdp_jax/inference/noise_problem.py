@@ -206,21 +206,18 @@ class NoiseProblem:
         return trial.where(is_accepted, draws)
 
     def with_other_noise(
-        self, rng: np.random.Generator, draws: NoiseDraws, names: np.ndarray
+        self, rng: np.random.Generator, draws: NoiseDraws
     ) -> NoiseDraws:
-        """The same draws under fixed gains, each with another noise.
+        """The same draws under fixed gains, of the same lineages, with other noise.
 
         Args:
             rng: source of randomness.
             draws: the list, none of which has moved.
-            names: of the lineages that they begin.
         """
         vector = self._proposal.sample(rng, draws.group)
         first = draws.log_first - self._proposal.log_density(draws.vector, draws.group)
         first = first + self._proposal.log_density(vector, draws.group)
-        return self._with_last(
-            draws._replace(vector=vector, log_first=first, root=names, family=names)
-        )
+        return self._with_last(draws._replace(vector=vector, log_first=first))
 
     def _given(
         self, draws: Fits, vector: np.ndarray, group: np.ndarray, rows: np.ndarray

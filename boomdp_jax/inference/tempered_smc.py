@@ -248,7 +248,8 @@ def next_step(log_ratio: np.ndarray, left: float, kept_share: float) -> float:
     """Largest step of the power that keeps the effective sample size, by bisection.
 
     Args:
-        log_ratio: of the densities at powers one and zero, of each particle.
+        log_ratio: of the densities at powers one and zero, of each particle, or
+            `[particle, choice]`: weights of the choices of a particle are added up.
         left: largest step that may be taken.
         kept_share: of the particles, that the weights must count for.
     """
@@ -257,12 +258,14 @@ def next_step(log_ratio: np.ndarray, left: float, kept_share: float) -> float:
         log_weight = times(step, log_ratio)
         top = log_weight.max()
         if not np.isfinite(top):
-            return float(log_ratio.size)
+            return float(len(log_ratio))
         weight = np.exp(log_weight - top)
+        weight = weight.reshape(len(log_ratio), -1).sum(axis=1)
         return float(weight.sum() ** 2 / (weight**2).sum())
 
     # What fell outside the mixture's cells is lost at any step.
-    least = kept_share * np.isfinite(log_ratio).sum()
+    is_there = np.isfinite(log_ratio).reshape(len(log_ratio), -1).any(axis=1)
+    least = kept_share * is_there.sum()
     if left <= 0.0 or size(left) >= least:
         return left
     low, high = 0.0, left

@@ -172,7 +172,9 @@ def coupled_substep(
         force,
         motion,
         final,
-        touches=touching(contacts, list(stage.sums)),
+        touches=touching(
+            contacts, [problem.mobile / problem.mass * p for p in stage.sums]
+        ),
         # Smoothed contacts push before bodies touch.
         is_closed=contacts.smoothing is None,
     )

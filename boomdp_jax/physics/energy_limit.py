@@ -6,7 +6,7 @@ kicks what joints hold, a step is wrong whatever it does. Twists are then scaled
 which joints do not notice, to the kinetic energy at the start and the work of forces
 and motors. Bodies that nothing joins have nothing to do with it: an island is what
 joints tie together, and all bodies in contact, since impulses of contacts bring energy
-from one to the other.
+from one to the other. (Whether Newton's method came to rest is known of a world alone.)
 
 All arrays are in lanes (`core.lanes`).
 """
@@ -24,6 +24,8 @@ from boomdp_jax.physics.prepare import Prepared
 # More of its kinetic energy no substep adds to an island out of nothing; where a
 # linkage comes close to a dead centre, it may come to a third.
 _MOST_GAIN = 0.005
+# Roundings of a coordinate that a displacement may be off by.
+_ROUNDING = 4.0
 
 PerBody = Float[Array, "body lane"]
 
@@ -55,7 +57,7 @@ def limited_energy(
         start: of the substep.
         end: of the substep.
         force: world frame, at the centres of mass [N, N, N m].
-        motors: most work that motors can have done, by either of their bodies.
+        motors: most work that motors can have done, by a body that each moves.
         touches: share of contact in a body's motion; None: nothing touches.
         doubts: about this substep.
 
@@ -76,17 +78,24 @@ def limited_energy(
         prepared.mobile * f * (new - old)
         for f, new, old in zip(forces, end[:3], start[:3], strict=True)
     )
+    # Where a body hardly moves, the work on it is rounding of where it is.
+    rounding = _ROUNDING * float(jnp.finfo(end.x.dtype).eps)
+    slack = sum(
+        prepared.mobile * jnp.abs(f) * jnp.maximum(jnp.abs(new), jnp.abs(old))
+        for f, new, old in zip(forces, end[:3], start[:3], strict=True)
+    )
+    slack = rounding * jax.lax.stop_gradient(slack)
     is_right = ~doubts.is_wrong & doubts.is_settled[None]
     first, present = kinetic(start), kinetic(end)
     motors = jnp.broadcast_to(motors, first.shape)
-    first, present, work, motors, num_wrong = _over_islands(
+    first, present, work, motors, slack, num_wrong = _over_islands(
         islands(prepared, touches),
-        (first, present, work, motors, (~is_right).astype(first.dtype)),
+        (first, present, work, motors, slack, (~is_right).astype(first.dtype)),
     )
     is_right = num_wrong == 0.0
-    allowed = jnp.maximum(first + work + motors, 0.0)
+    allowed = jnp.maximum(first + work + motors, 0.0) + slack
     # Overlapping bodies may be moved up without being paid for it.
-    most = first + jnp.maximum(work, 0.0) + motors
+    most = first + jnp.maximum(work, 0.0) + motors + slack
     is_kicked = doubts.is_closed & (present > (1.0 + _MOST_GAIN) * most)
     allowed = jnp.where(is_right, most, allowed)
     is_much = (~is_right | is_kicked) & (present > allowed)
@@ -103,7 +112,8 @@ def islands(prepared: Prepared, touches: PerBody | None) -> PerBody | None:
 
     Args:
         prepared: joints, and which bodies are held fast, which join nothing.
-        touches: bodies of which this is not zero are one island.
+        touches: bodies of which this is more than a half are one island. Contacts that
+            are smoothed push a little at any distance.
     """
     num_bodies = prepared.mass.shape[0]
     if num_bodies == 1:
@@ -112,7 +122,7 @@ def islands(prepared: Prepared, touches: PerBody | None) -> PerBody | None:
     own = jnp.arange(1, num_bodies + 1, dtype=mobile.dtype)[:, None]
     name = jnp.broadcast_to(own, mobile.shape)
     if touches is not None:
-        name = jnp.where(touches != 0.0, 0.0, name)
+        name = jnp.where(touches > 0.5, 0.0, name)
     joints = prepared.joints
     slots = [
         _Link(ends.a, ends.b, ends.has_b * ends.on * _both(ends, mobile))
@@ -163,5 +173,8 @@ def _over_islands(name: PerBody | None, values: tuple) -> tuple:
     """Of each body what its island has in all."""
     if name is None:
         return values
-    is_same = (name[:, None] == name[None]).astype(values[0].dtype)
-    return tuple(jnp.sum(is_same * value[None], axis=1) for value in values)
+    is_same = name[:, None] == name[None]
+    # Not a product: what is not finite stays on its own island.
+    return tuple(
+        jnp.sum(jnp.where(is_same, value[None], 0.0), axis=1) for value in values
+    )

@@ -16,6 +16,7 @@ from boomdp_jax.physics.joints import (
     Frames,
     bilateral_rows,
     join,
+    moved_end,
     of_body,
     on_bodies,
 )
@@ -142,10 +143,11 @@ def _drives(
     for drive, row in drive_rows(prepared, middle):
         rows = tied(row, prepared.mass.shape[0])
         moving = speed(rows, start)
+        end = moved_end(row, prepared.mobile)
         for spin, target in ((drive.friction, None), (drive.motor, drive.target)):
             if spin is not None:
                 aim = jnp.zeros_like(moving) if target is None else target
-                laws.append(Laws(rows, Spin(*spin), moving, aim, row.a))
+                laws.append(Laws(rows, Spin(*spin), moving, aim, end))
         if drive.lower is not None:
             limits.append(_range(prepared, drive, rows, row.error, moving))
     return join(*laws), join(*limits)
@@ -227,9 +229,9 @@ def projected(
 def _of_rows(
     problem: VelocityProblem, is_so: Bool[Array, "row lane"]
 ) -> Bool[Array, "body lane"]:
-    """Bodies with a joint row of which something holds: the first of each row's two."""
-    rows: Any = problem.rows_mid
-    return on_bodies(rows.a, is_so, problem.mass.shape[0]) > 0.0
+    """Bodies with a joint row of which something holds, one of each row's two."""
+    index = moved_end(problem.rows_mid, problem.mobile)
+    return on_bodies(index, is_so, problem.mass.shape[0]) > 0.0
 
 
 def _is_fast(
@@ -253,7 +255,7 @@ def _is_fast(
 def _motor_work(
     prepared: Prepared, problem: VelocityProblem, end: Motion
 ) -> PerBody | float:
-    """Most that motors can have done, by the first of the bodies that each turns."""
+    """Most that motors can have done, by a body that each moves."""
     laws = problem.laws
     if laws is None:
         return 0.0

@@ -173,6 +173,16 @@ def on_bodies(index: PerRow, values: Any, num_bodies: int) -> PerBody:
     return jnp.sum(jnp.where(is_it, jnp.asarray(values, index.dtype)[:, None], 0.0), 0)
 
 
+def moved_end(rows: Any, mobile: PerBody) -> PerRow:
+    """Index of a body of each row that is not static: the first one, if it can be.
+
+    Args:
+        rows: `Rows`, or anything with both indices.
+        mobile: one, or zero for a static body.
+    """
+    return jnp.where(of_body(rows.a, mobile) > 0.0, rows.a, rows.b)
+
+
 def bilateral_rows(joints: Joints, frames: Frames) -> Rows | None:
     """All rows that hold in both directions.
 

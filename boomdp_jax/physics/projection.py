@@ -17,6 +17,7 @@ from boomdp_jax.physics.joints import (
     Rows,
     bilateral_rows,
     join,
+    moved_end,
     on_bodies,
     slide_rows,
     turn_rows,
@@ -97,7 +98,7 @@ def project(
 
     Returns:
         The closest motion, in kinetic energy, to first order; and bodies with a joint
-        that was far, the first of its two.
+        that was far, one of its two.
     """
     one = runtime_one(prepared.mass)
     if not has_rows(prepared):
@@ -160,7 +161,7 @@ def _put_again(problem: tuple, place: tuple, rest: tuple) -> tuple:
 def _nearer(prepared: Prepared, place: tuple) -> tuple[tuple, Bool[Array, "body lane"]]:
     """One linear correction of poses, in which no body turns too far.
 
-    And the first bodies of rows that were far.
+    And a body of each row that was far.
     """
     zero = jnp.zeros_like(place[0])
     motion = Motion(*place, zero, zero, zero)
@@ -169,7 +170,8 @@ def _nearer(prepared: Prepared, place: tuple) -> tuple[tuple, Bool[Array, "body 
     assert counts is not None
     lever = jnp.abs(rows.ja[2]) + jnp.abs(rows.jb[2]) + _LEAST_LEVER
     is_far_row = jnp.abs(counts * rows.error) > _FAR * lever
-    is_far = on_bodies(rows.a, is_far_row, zero.shape[0]) > 0.0
+    index = moved_end(rows, prepared.mobile)
+    is_far = on_bodies(index, is_far_row, zero.shape[0]) > 0.0
     change = _corrected(prepared, rows, counts, rows.error, (zero, zero, zero))
     turn = jnp.max(jnp.abs(change[2]), axis=0)
     is_wide = turn > _MOST_TURN

@@ -63,7 +63,7 @@ class Laws(NamedTuple):
     target: PerRow
     """Speed that it drives at, zero for friction."""
     body: PerRow
-    """Index of one of the bodies that it acts on."""
+    """Index of a body that it moves."""
 
 
 class Limits(NamedTuple):

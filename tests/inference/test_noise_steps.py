@@ -29,9 +29,9 @@ class Normal(NoiseProblem):
     def only(self, rows):
         return Normal(self.index[rows])
 
-    def with_other_noise(self, rng, draws, names):
+    def with_other_noise(self, rng, draws):
         vector = rng.standard_normal(draws.vector.shape)
-        return self.of(draws.z, vector, names)
+        return self.of(draws.z, vector, draws.root)
 
     def of(self, z, vector, names):
         first = norm.logpdf(z[:, 0]) + norm.logpdf(vector[:, 0])
@@ -92,14 +92,43 @@ def test_they_follow_the_density_on_the_way_and_their_mean_weight_is_its_whole(s
 def test_chains_choose_among_their_own_draws(stepped):
     draws, found = stepped
     chain = np.arange(len(draws.root)) // NUM_EACH
-    np.testing.assert_array_equal(found.draws.root % len(chain) // NUM_EACH, chain)
+    np.testing.assert_array_equal(found.draws.root // NUM_EACH, chain)
     # A draw's coordinates are those of its root, whatever its noise.
-    where = found.draws.root % len(chain)
-    np.testing.assert_array_equal(found.draws.z, draws.z[where])
-    has_own = found.draws.root < len(chain)
-    np.testing.assert_array_equal(
-        found.draws.vector[has_own], draws.vector[where[has_own]]
-    )
+    np.testing.assert_array_equal(found.draws.z, draws.z[found.draws.root])
+    # Some have the noise that they had, some another one.
+    is_first = found.draws.vector[:, 0] == draws.vector[found.draws.root, 0]
+    first = is_first[: len(chain) // 2]
+    assert 0.05 < np.mean(first) < 0.5
+    assert np.all(is_first[len(chain) // 2 :])
+
+
+class Far(Normal):
+    """All noises are as good; of coordinates one in nine counts."""
+
+    def only(self, rows):
+        return Far(self.index[rows])
+
+    def of(self, z, vector, names):
+        plain = super().of(z, vector, names)
+        first = plain.log_first
+        last = norm.logpdf(vector[:, 0]) + norm.logpdf(z[:, 0], MIDDLE, SD)
+        return plain._replace(log_first=first, log_last=last)
+
+
+def test_more_noises_do_not_pass_for_more_draws():
+    rng = np.random.default_rng(2)
+    index = np.zeros(NUM_CHAINS * NUM_EACH, int)
+    problem = Far(index)
+    z = rng.standard_normal((len(index), 1))
+    draws = problem.of(z, rng.standard_normal(z.shape), np.arange(len(index)))
+    alone = effective_size(draws.ratio)
+    found = first_step(rng, problem, draws, index, NUM_CHAINS)
+    assert found.size[0] == pytest.approx(alone, rel=1e-6)
+    # As long a step as with one noise each.
+    one = further_step(rng, draws, np.zeros(1), NUM_CHAINS)
+    assert found.step[0] == pytest.approx(one.step[0], rel=1e-6)
+    num = [len(np.unique(step.draws.z)) for step in (found, one)]
+    assert num[0] == pytest.approx(num[1], rel=0.05)
 
 
 def test_objects_that_have_arrived_stay(stepped):

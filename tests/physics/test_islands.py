@@ -1,5 +1,7 @@
 """What nothing joins moves as if it were alone, whatever goes wrong beside it."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -134,4 +136,57 @@ def test_what_contact_brings_is_not_taken_away():
 def test_many_islands_are_what_each_is_alone(alone):
     together = run(ISLANDS.values())[:, :-1]
     expected = np.concatenate(list(alone.values()), axis=1)
+    np.testing.assert_allclose(together, expected, rtol=1e-3, atol=1e-3)
+
+
+def states_of(content, twist, num_steps, smoothing=None):
+    """States `[step, body, 6]` without wrenches but gravity's."""
+    spec = scene_spec_from_dict({"schema": "planar-scene-1", **content})
+    state = spec.initial_state()
+    state = type(state)(state.pose, jnp.asarray(twist, state.pose.dtype))
+    scene = spec.scene
+    if smoothing is not None:
+        scene = dataclasses.replace(scene, smoothing=jnp.asarray(smoothing))
+    wrenches = jnp.zeros((num_steps, spec.num_bodies, 3), state.pose.dtype)
+    return np.asarray(rollout(scene, spec.params(), state, wrenches)[0].array)
+
+
+@pytest.mark.parametrize("first", ["post", "bar"])
+def test_a_motor_turns_the_body_that_can_move(first):
+    """About a post that is held fast, whichever of both is named first."""
+    ends = {"post": [0.0, 0.0], "bar": [-0.25, 0.0]}
+    second = "bar" if first == "post" else "post"
+    motor = {"motor_speed": 3.0 if first == "bar" else -3.0, "motor_torque": 2.0}
+    bodies = [box("post", 0.0, static=True), box("bar", 0.25)]
+    joint = pin(first, second, ends[first], ends[second]) | motor
+    content = {"dt": DT, "bodies": bodies, "constraints": [joint]}
+    states = states_of(content, [REST, REST], 20)
+    # Mass 3 kg, inertia about its middle (0.5^2 + 0.3^2) / 12 of that.
+    inertia = 3.0 * ((0.5**2 + 0.3**2) / 12.0 + 0.25**2)
+    speed = 2.0 * DT * np.arange(1, 21) / inertia
+    np.testing.assert_allclose(states[:, 1, 5], np.minimum(speed, 3.0), rtol=2e-2)
+
+
+@pytest.mark.parametrize(
+    ("place", "pull", "dt"),
+    [(5.0, 0.02, 0.005), (10.0, 0.008, 0.02), (40.0, 0.03, 0.02), (100.0, 0.05, 0.02)],
+)
+def test_a_body_that_starts_slowly_starts(place, pull, dt):
+    """So slowly that rounding hides how far it has come; another one moves."""
+    bodies = [box("slow", place), box("fast", place, 5.0)]
+    content = {"dt": dt, "bodies": bodies, "gravity": [pull, 0.0]}
+    states = states_of(content, [REST, [1.0, 0.0, 0.0]], 50)
+    time = dt * np.arange(1, 51)
+    np.testing.assert_allclose(states[:, 0, 3], pull * time, rtol=1e-3)
+
+
+def test_smoothed_contact_far_away_joins_nothing():
+    contact = {"contact": DISC["contact"]}
+    table = ISLANDS[OFF]
+    bodies = [box("box", -9.0) | contact, table.bodies[0] | contact]
+    content = {"dt": DT, "bodies": bodies, "gravity": [1.0, -2.0]}
+    twist = [[0.5, 0.0, 2.0], [-2.0, 3.0, 0.0]]
+    expected = states_of(content, twist, 3, smoothing=0.02)[:, 0]
+    content |= {"constraints": table.constraints}
+    together = states_of(content, twist, 3, smoothing=0.02)[:, 0]
     np.testing.assert_allclose(together, expected, rtol=1e-3, atol=1e-3)
