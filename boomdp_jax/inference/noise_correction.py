@@ -60,8 +60,6 @@ class Corrected(NamedTuple):
     log_density: np.ndarray
     """Of structure, coordinates, noise and readings, `[object, chain, draw]`."""
     evidence: StructureEvidence
-    sample_size: np.ndarray
-    """Draws that the first weights count for, `[object]`."""
     reasons: list[list[str]]
 
 
@@ -96,20 +94,20 @@ def infer_noise(
     power, steps = np.zeros(num_objects), 0
     log_share = np.zeros((num_objects, num_chains))
     before = draws.structure
-    first_size = np.zeros(num_objects)
+    is_good = np.zeros(num_objects, bool)
     kinds = MoveKinds(problem.num_groups)
     while steps == 0 or (np.any(power < 1.0) and steps < _MAX_STEPS):
         is_under_way = power < 1.0
         if steps == 0:
-            found = first_step(rng, problem, draws, index, num_chains)
-            first_size = found.size
+            found, size = first_step(rng, problem, draws, index, num_chains)
+            is_good = size > _GOOD_SHARE * structure[0].size
         else:
             found = further_step(rng, draws, power, num_chains)
         draws = found.draws
         log_share += found.log_mean
         power = np.where(found.step >= 1.0 - power, 1.0, power + found.step)
         steps += 1
-        is_easy = (steps == 1) & (first_size > _GOOD_SHARE * structure[0].size)
+        is_easy = (steps == 1) & is_good
         num_moves = np.where((power >= 1.0) & ~is_easy, _LAST_MOVES, _MOVES_BETWEEN)
         num_moves = np.where(is_under_way, num_moves, 0)
         for number in range(num_moves.max()):
@@ -147,7 +145,6 @@ def infer_noise(
         noise=NoiseFit.of_vector(draws.vector),
         log_density=(draws.log_last - draws.log_volume).reshape(shape),
         evidence=changed,
-        sample_size=first_size,
         reasons=reasons,
     )
 

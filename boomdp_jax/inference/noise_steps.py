@@ -36,9 +36,6 @@ class Resampled(NamedTuple):
     """By how much the power grew, `[object]`."""
     log_mean: np.ndarray
     """Of the weights of each chain, `[object, chain]`; zero where nothing was done."""
-    size: np.ndarray
-    """Draws that weights to the last density count for, `[object]`; of draws with
-    several noises their sums."""
 
 
 def first_step(
@@ -47,7 +44,7 @@ def first_step(
     draws: NoiseDraws,
     index: np.ndarray,
     num_chains: int,
-) -> Resampled:
+) -> tuple[Resampled, np.ndarray]:
     """Resample for the first time, giving draws more noises where few are any good.
 
     Args:
@@ -56,6 +53,10 @@ def first_step(
         draws: the list, each with one noise.
         index: object of each draw, as many of each.
         num_chains: of each object, one after the other in the list.
+
+    Returns:
+        What was done, and draws that weights to the last density count for, `[object]`;
+        of draws with several noises their sums.
     """
     num_objects = int(index[-1]) + 1
     num_draws = len(index) // num_objects
@@ -84,16 +85,12 @@ def first_step(
         places = _places(rng, log_weight, num_each)
         place, noise = np.divmod(places, len(pool))
         place = place + num_each * np.arange(num_chains)[:, None]
-        joined = NoiseDraws(*map(np.concatenate, zip(*pool, strict=True)))
-        chosen.append(joined.take((num_draws * noise + place).ravel()))
+        whole = NoiseDraws(*map(np.concatenate, zip(*pool, strict=True)))
+        chosen.append(whole.take((num_draws * noise + place).ravel()))
         steps.append(step)
         log_means.append(_log_mean(log_weight))
-    return Resampled(
-        NoiseDraws(*map(np.concatenate, zip(*chosen, strict=True))),
-        np.array(steps),
-        np.array(log_means),
-        size,
-    )
+    joined = NoiseDraws(*map(np.concatenate, zip(*chosen, strict=True)))
+    return Resampled(joined, np.array(steps), np.array(log_means)), size
 
 
 def further_step(
@@ -117,8 +114,7 @@ def further_step(
         log_mean[i] = _log_mean(log_weight)
         places = _places(rng, log_weight, num_each)
         rows[i] = np.take_along_axis(rows[i], places, axis=1)
-    size = np.array([effective_size(each.ravel()) for each in ratio])
-    return Resampled(draws.take(rows.ravel()), steps, log_mean, size)
+    return Resampled(draws.take(rows.ravel()), steps, log_mean)
 
 
 def _size(pool: list[NoiseDraws]) -> float:

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from boomdp_jax.physics.joints import Ends, of_body
+from boomdp_jax.physics.islands import joined_by_contact, over_islands
 from boomdp_jax.physics.motion import Motion
 from boomdp_jax.physics.prepare import Prepared
 
@@ -88,8 +88,11 @@ def limited_energy(
     is_right = ~doubts.is_wrong & doubts.is_settled[None]
     first, present = kinetic(start), kinetic(end)
     motors = jnp.broadcast_to(motors, first.shape)
-    first, present, work, motors, slack, num_wrong = _over_islands(
-        islands(prepared, touches),
+    islands = prepared.islands
+    if touches is not None and islands is not None:
+        islands = joined_by_contact(islands, touches)
+    first, present, work, motors, slack, num_wrong = over_islands(
+        islands,
         (first, present, work, motors, slack, (~is_right).astype(first.dtype)),
     )
     is_right = num_wrong == 0.0
@@ -105,76 +108,3 @@ def limited_energy(
     root = jnp.sqrt(jnp.where(has_ratio, ratio, 1.0))
     scale = jnp.where(is_much, jnp.where(has_ratio, root, 0.0), 1.0)
     return end._replace(vx=scale * end.vx, vy=scale * end.vy, spin=scale * end.spin)
-
-
-def islands(prepared: Prepared, touches: PerBody | None) -> PerBody | None:
-    """A name of each body's island; None where there is a single body.
-
-    Args:
-        prepared: joints, and which bodies are held fast, which join nothing.
-        touches: bodies of which this is more than a half are one island. Contacts that
-            are smoothed push a little at any distance.
-    """
-    num_bodies = prepared.mass.shape[0]
-    if num_bodies == 1:
-        return None
-    mobile = jax.lax.stop_gradient(prepared.mobile)
-    own = jnp.arange(1, num_bodies + 1, dtype=mobile.dtype)[:, None]
-    name = jnp.broadcast_to(own, mobile.shape)
-    if touches is not None:
-        name = jnp.where(touches > 0.5, 0.0, name)
-    joints = prepared.joints
-    slots = [
-        _Link(ends.a, ends.b, ends.has_b * ends.on * _both(ends, mobile))
-        for ends in (joints.points, joints.rods, joints.angles)
-        if ends is not None
-    ]
-    if not slots:
-        return name
-    links = jax.lax.stop_gradient(
-        _Link(*(jnp.concatenate(parts) for parts in zip(*slots, strict=True)))
-    )
-    if num_bodies == 2:
-        return _spread(links, name)
-
-    def goes_on(carry):
-        return carry[1]
-
-    def again(carry):
-        new = _spread(links, carry[0])
-        return new, jnp.any(new != carry[0])
-
-    return jax.lax.while_loop(goes_on, again, (name, jnp.asarray(True)))[0]
-
-
-class _Link(NamedTuple):
-    """Of each slot which bodies it ties, and one where it does, else zero."""
-
-    a: Float[Array, "slot lane"]
-    b: Float[Array, "slot lane"]
-    on: Float[Array, "slot lane"]
-
-
-def _both(ends: Ends, mobile: PerBody) -> Float[Array, "slot lane"]:
-    return of_body(ends.a, mobile) * of_body(ends.b, mobile)
-
-
-def _spread(links: _Link, name: PerBody) -> PerBody:
-    """Both bodies of a link get the lesser name."""
-    least = jnp.minimum(of_body(links.a, name), of_body(links.b, name))
-    beyond = float(name.shape[0] + 1)
-    least = jnp.where(links.on > 0.0, least, beyond)[:, None]
-    body = jnp.arange(name.shape[0], dtype=name.dtype)[None, :, None]
-    is_end = (links.a[:, None] == body) | (links.b[:, None] == body)
-    return jnp.minimum(name, jnp.min(jnp.where(is_end, least, beyond), axis=0))
-
-
-def _over_islands(name: PerBody | None, values: tuple) -> tuple:
-    """Of each body what its island has in all."""
-    if name is None:
-        return values
-    is_same = name[:, None] == name[None]
-    # Not a product: what is not finite stays on its own island.
-    return tuple(
-        jnp.sum(jnp.where(is_same, value[None], 0.0), axis=1) for value in values
-    )

@@ -24,6 +24,7 @@ from boomdp_jax.physics.implicit_fit import (
     fit_weights,
     implicit_weight,
 )
+from boomdp_jax.physics.islands import joint_islands
 from boomdp_jax.physics.joints import Ends, Joints, joints_of, of_body
 from boomdp_jax.physics.lone_body import LoneBody, Pin, lone_body
 from boomdp_jax.physics.lone_rail import (
@@ -91,6 +92,8 @@ class Prepared(NamedTuple):
     """Of the revolute slots."""
     sliding: Drive | None
     """Of the prismatic slots."""
+    islands: Float[Array, "body lane"] | None
+    """A name of what joints tie together; None where there is a single body."""
 
 
 def is_lone(scene: Scene, params: Params) -> bool:
@@ -195,7 +198,8 @@ def prepare_world(
     if joints.guides is not None and params.prismatic is not None:
         ease = _both(joints.guides, bodies.mobile / bodies.mass)
         sliding = _drive(params.prismatic, ease, length, True)
-    return Prepared(*bodies, joints, turning, sliding)
+    islands = joint_islands(joints, bodies.mobile)
+    return Prepared(*bodies, joints, turning, sliding, islands)
 
 
 def prepare_bodies(

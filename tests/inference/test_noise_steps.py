@@ -56,18 +56,18 @@ def stepped():
 
 
 def test_draws_get_more_noises_where_few_are_any_good(stepped):
-    draws, found = stepped
+    draws, (found, size) = stepped
     num = NUM_CHAINS * NUM_EACH
     assert effective_size(draws.ratio[:num]) < 0.25 * num
-    assert found.size[0] > 0.25 * num
-    assert found.size[1] == pytest.approx(num)
+    assert size[0] > 0.25 * num
+    assert size[1] == pytest.approx(num)
     # The names of the second object's draws are those that they had, each once.
     np.testing.assert_array_equal(np.sort(found.draws.root[num:]), draws.root[num:])
     assert len(np.unique(found.draws.root[:num])) > 0.2 * num
 
 
 def test_they_follow_the_density_on_the_way_and_their_mean_weight_is_its_whole(stepped):
-    _, found = stepped
+    _, (found, _) = stepped
     num, share = NUM_CHAINS * NUM_EACH, found.step[0]
     assert 0.3 < share < 1.0
     grid = np.linspace(-8.0, 8.0, 20_001)
@@ -90,7 +90,7 @@ def test_they_follow_the_density_on_the_way_and_their_mean_weight_is_its_whole(s
 
 
 def test_chains_choose_among_their_own_draws(stepped):
-    draws, found = stepped
+    draws, (found, _) = stepped
     chain = np.arange(len(draws.root)) // NUM_EACH
     np.testing.assert_array_equal(found.draws.root // NUM_EACH, chain)
     # A draw's coordinates are those of its root, whatever its noise.
@@ -122,8 +122,8 @@ def test_more_noises_do_not_pass_for_more_draws():
     z = rng.standard_normal((len(index), 1))
     draws = problem.of(z, rng.standard_normal(z.shape), np.arange(len(index)))
     alone = effective_size(draws.ratio)
-    found = first_step(rng, problem, draws, index, NUM_CHAINS)
-    assert found.size[0] == pytest.approx(alone, rel=1e-6)
+    found, size = first_step(rng, problem, draws, index, NUM_CHAINS)
+    assert size[0] == pytest.approx(alone, rel=1e-6)
     # As long a step as with one noise each.
     one = further_step(rng, draws, np.zeros(1), NUM_CHAINS)
     assert found.step[0] == pytest.approx(one.step[0], rel=1e-6)
