@@ -5,16 +5,17 @@ all of them are iterated together. What is left then, of random tracks one in se
 is taken out of the batch and iterated by itself (`friction.LATE_SHARES`).
 """
 
+import functools
 import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
 
 from boomdp_jax.core.any_in_batch import any_in_batch
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar
+from boomdp_jax.core.few_at_a_time import few_at_a_time
 from boomdp_jax.core.lanes import in_lanes
 from boomdp_jax.core.one_loop import one_loop
 from boomdp_jax.physics.friction import LATE_SHARES, NUM_LATE, NUM_NEWTON
@@ -148,30 +149,13 @@ def _rest(problem_of: Callable[..., Rubbing], given: tuple, search: Search) -> S
     num = search.is_open.shape[-1]
     if num <= _FEW:
         return _to_the_end(problem_of, given, search)
-    at_a_time = max(_AT_A_TIME, num // _ONE_IN)
-    is_open = search.is_open > 0
-    count = jnp.cumsum(is_open.astype(jnp.int32))
-    # Open lanes in order, then a number that is none's.
-    place = jnp.where(is_open, count - 1, num + at_a_time)
-    order = jnp.full(num + at_a_time, num, jnp.int32)
-    order = order.at[place].set(jnp.arange(num, dtype=jnp.int32), mode="drop")
-
-    def go_on(carry: tuple) -> tuple:
-        begin, search = carry
-        lanes = jax.lax.dynamic_slice(order, (begin,), (at_a_time,))
-
-        def taken(leaf: Array) -> Array:
-            # Where there are fewer, the last lane stands in, and is not put back.
-            return leaf.at[lanes].get(mode="clip")
-
-        few = _to_the_end(problem_of, *jax.tree.map(taken, (given, search)))
-        search = jax.tree.map(
-            lambda leaf, part: leaf.at[lanes].set(part, mode="drop"), search, few
-        )
-        return begin + at_a_time, search
-
-    start = jnp.zeros((), jnp.int32), search
-    return jax.lax.while_loop(lambda carry: carry[0] < count[-1], go_on, start)[1]
+    return few_at_a_time(
+        functools.partial(_to_the_end, problem_of),
+        search.is_open > 0,
+        given,
+        search,
+        max(_AT_A_TIME, num // _ONE_IN),
+    )
 
 
 def _to_the_end(

@@ -2,9 +2,10 @@ r"""Newton's method for the implicit velocity update, until it comes to rest.
 
 It starts from the solution in which everything sticks: from there a contact that slips
 is left on its own side, and one that sticks is already solved. After `NUM_NEWTON`
-iterations few are left. In further ones each step ends where nothing is left to gain
-along it, which solves what has a potential, joints with friction and motors among it.
-What is left then goes on by `LATE_SHARES` of steps, `NUM_LATE` times.
+iterations few are left, which are taken out of the batch. In further ones each step
+ends where nothing is left to gain along it, which solves what has a potential, joints
+with friction and motors among it. What is left then goes on by `LATE_SHARES` of steps,
+`NUM_LATE` times.
 
 Derivatives are those of one more iteration with what it starts from held constant
 (`core.searched`).
@@ -14,12 +15,13 @@ All arrays are in lanes (`core.lanes`).
 
 import functools
 import itertools
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
+from boomdp_jax.core.few_at_a_time import few_at_a_time
 from boomdp_jax.core.one_loop import elementwise
 from boomdp_jax.core.searched import searched
 from boomdp_jax.physics.body_friction import Felt, friction_of_bodies, into_frame
@@ -39,6 +41,17 @@ from boomdp_jax.physics.velocity_solve import (
 _NUM_LINES, _NUM_NARROWED = 12, 5
 # Relative change in the last iteration from which a lane counts as not settled.
 _UNSETTLED = 1e-3
+# Lanes from which none are taken out; else, when one in so many is left.
+_FEW, _ONE_IN, _AT_LEAST = 32, 8, 16
+
+
+class _Search(NamedTuple):
+    """Newton's method under way."""
+
+    found: Solution
+    is_open: Bool[Array, " lane"]
+    """Where the solution still changes."""
+    is_settled: Bool[Array, " lane"]
 
 
 def solve_velocity(problem: VelocityProblem) -> Solved:
@@ -94,64 +107,136 @@ def _step(problem: VelocityProblem, found: tuple, rest: tuple) -> tuple:
 
 def _search(problem: VelocityProblem, start: tuple) -> tuple:
     """Twists and impulses; and the twists before, and whether these are settled."""
-    guess, is_open, turn = start
-    has_any = _has_any(problem)
-
-    shares = jnp.asarray(LATE_SHARES, problem.mass.dtype)
-    going_on, from_free, total = itertools.accumulate(NUM_LATE)
-    x, y, spin = problem.momentum
-    light = problem.mobile / problem.mass
-    free = (light * x, light * y, problem.mobile / problem.inertia * spin)
+    guess, is_wanted, turn = start
+    num = is_wanted.shape[-1]
+    every = jnp.ones_like(is_wanted)
+    search = _Search(guess, every, every)
+    most_left = num // _ONE_IN if num > _FEW else 0
 
     def goes_on(carry):
-        turn, _, is_moving, _ = carry
-        return jnp.any(is_moving) & (turn < NUM_NEWTON + _NUM_LINES + total)
-
-    def advance(carry):
-        turn, last, is_moving, is_settled = carry
-        is_limited = jnp.where(turn > 0, 1.0, 0.0).astype(problem.mass.dtype)
+        turn, search = carry
         is_early = turn < NUM_NEWTON
-        late = turn - NUM_NEWTON - _NUM_LINES
-        is_line = ~is_early & (late < 0)
-        guess = last._replace(
-            # What slips beyond rest may do so, so that nothing is taken to stick.
-            before=jax.tree.map(
-                lambda now, old: jnp.where(is_early, old, now), last.twist, last.before
-            )
+        return is_early & (jnp.sum(search.is_open.astype(jnp.int32)) > most_left)
+
+    def go_on(carry):
+        turn, search = carry
+        return turn + 1, _advanced(problem, is_wanted, turn, search, is_early=True)
+
+    if num > _FEW:
+        turn, search = jax.lax.while_loop(goes_on, go_on, (turn, search))
+        search = few_at_a_time(
+            lambda known, search: _to_the_end(*known, turn, search),
+            search.is_open,
+            (problem, is_wanted),
+            search,
+            max(most_left, _AT_LEAST),
         )
-        for begin, twist in ((going_on, free), (from_free, problem.start)):
-            guess = _from_elsewhere(guess, late == begin, twist)
-        found, is_whole = newton_step(problem, guess, is_limited)
-        is_near = ~_has_moved(guess.twist, found.twist, _UNSETTLED) & is_whole
-        has_moved = (turn == 0) | ~is_whole | _has_moved(guess.twist, found.twist)
-        share = jax.lax.cond(is_line, _good_share, _whole, problem, guess, found)
-        late_share = shares[late % len(LATE_SHARES)]
-        share = jnp.where(late >= 0, late_share, share)[None]
+    else:
+        search = _to_the_end(problem, is_wanted, turn, search)
+    found = search.found
+    return (found.twist, found.impulse), (found.before, search.is_settled)
+
+
+def _to_the_end(
+    problem: VelocityProblem,
+    is_wanted: Bool[Array, " lane"],
+    turn: Array,
+    search: _Search,
+) -> _Search:
+    """All iterations that are left."""
+
+    def goes_on(carry):
+        turn, search = carry
+        total = NUM_NEWTON + _NUM_LINES + sum(NUM_LATE)
+        return jnp.any(search.is_open) & (turn < total)
+
+    def go_on(carry):
+        turn, search = carry
+        return turn + 1, _advanced(problem, is_wanted, turn, search, is_early=False)
+
+    return jax.lax.while_loop(goes_on, go_on, (turn, search))[1]
+
+
+def _advanced(
+    problem: VelocityProblem,
+    is_wanted: Bool[Array, " lane"],
+    turn: Array,
+    search: _Search,
+    *,
+    is_early: bool,
+) -> _Search:
+    """One iteration.
+
+    Args:
+        problem: momenta, frictions and joint rows.
+        is_wanted: where more than one iteration is.
+        turn: how many came before.
+        search: after those.
+        is_early: whether it is known to be one of the first `NUM_NEWTON`.
+
+    Returns:
+        The search after it. Lanes that are done stay as they are, whatever the others
+        do.
+    """
+    last = guess = search.found
+    dtype = problem.mass.dtype
+    is_limited = jnp.where(turn > 0, 1.0, 0.0).astype(dtype)
+    if not is_early:
+        guess = _late_guess(problem, turn, last)
+    found, is_whole = newton_step(problem, guess, is_limited)
+    is_near = ~_has_moved(guess.twist, found.twist, _UNSETTLED) & is_whole
+    has_moved = (turn == 0) | ~is_whole | _has_moved(guess.twist, found.twist)
+    if not is_early:
+        share = _share(problem, turn, guess, found)
         twist, impulse = jax.tree.map(
             lambda old, new: old + share * (new - old),
             (guess.twist, guess.impulse),
             (found.twist, found.impulse),
         )
-        # The first has none before it that slipped.
-        x, y, spin = (
-            jnp.where(turn == 0, new, old)
-            for new, old in zip(twist, found.before, strict=True)
-        )
-        found = Solution(twist, (x, y, spin), impulse)
-        # Lanes that are done stay as they are, whatever the others do.
-        found = jax.tree.map(
-            lambda new, old: jnp.where(is_moving[None], new, old), found, last
-        )
-        is_settled = jnp.where(is_moving, is_near | ~has_any, is_settled)
-        # All have one iteration, which is all that lanes need that are not open.
-        is_moving = is_moving & is_open & has_any & has_moved
-        return turn + 1, found, is_moving, is_settled
-
-    every = jnp.ones_like(is_open)
-    _, found, _, is_settled = jax.lax.while_loop(
-        goes_on, advance, (turn, guess, every, every)
+        found = Solution(twist, found.before, impulse)
+    # The first has none before it that slipped.
+    x, y, spin = (
+        jnp.where(turn == 0, new, old)
+        for new, old in zip(found.twist, found.before, strict=True)
     )
-    return (found.twist, found.impulse), (found.before, is_settled)
+    found = found._replace(before=(x, y, spin))
+    is_open, has_any = search.is_open, _has_any(problem)
+    found = jax.tree.map(
+        lambda new, old: jnp.where(is_open[None], new, old), found, last
+    )
+    is_settled = jnp.where(is_open, is_near | ~has_any, search.is_settled)
+    return _Search(found, is_open & is_wanted & has_any & has_moved, is_settled)
+
+
+def _late_guess(problem: VelocityProblem, turn: Array, last: Solution) -> Solution:
+    """Where an iteration begins, which may be a later one."""
+    x, y, spin = problem.momentum
+    light = problem.mobile / problem.mass
+    free = (light * x, light * y, problem.mobile / problem.inertia * spin)
+    late = turn - NUM_NEWTON - _NUM_LINES
+    going_on, from_free, _ = itertools.accumulate(NUM_LATE)
+    # What slips beyond rest may do so, so that nothing is taken to stick.
+    guess = last._replace(
+        before=jax.tree.map(
+            lambda now, old: jnp.where(turn < NUM_NEWTON, old, now),
+            last.twist,
+            last.before,
+        )
+    )
+    for begin, twist in ((going_on, free), (from_free, problem.start)):
+        guess = _from_elsewhere(guess, late == begin, twist)
+    return guess
+
+
+def _share(
+    problem: VelocityProblem, turn: Array, guess: Solution, found: Solution
+) -> Float[Array, "1 lane"]:
+    """Share that is taken of an iteration."""
+    late = turn - NUM_NEWTON - _NUM_LINES
+    is_line = (turn >= NUM_NEWTON) & (late < 0)
+    share = jax.lax.cond(is_line, _good_share, _whole, problem, guess, found)
+    late_share = jnp.asarray(LATE_SHARES, share.dtype)[late % len(LATE_SHARES)]
+    return jnp.where(late >= 0, late_share, share)[None]
 
 
 def _whole(problem: VelocityProblem, guess: Solution, found: Solution) -> Array:
@@ -169,8 +254,8 @@ def _good_share(problem: VelocityProblem, guess: Solution, found: Solution) -> A
     step = tuple(v - u for u, v in zip(guess.twist, found.twist, strict=True))
 
     def narrow(turn, ends):
-        low, high, at_low, at_high = ends
-        share = jnp.clip(_secant(*ends[2:]), 0.05, 0.95)
+        low, high, at_low, at_high, _ = ends
+        share = jnp.clip(_secant(at_low, at_high), 0.05, 0.95)
         share = low + (high - low) * share
         # Both ends come first.
         share = jnp.where(turn == 0, 0.0, jnp.where(turn == 1, 1.0, share))
@@ -181,14 +266,18 @@ def _good_share(problem: VelocityProblem, guess: Solution, found: Solution) -> A
             jnp.where(is_low, high, share),
             jnp.where(is_low, value, at_low),
             jnp.where(is_low, at_high, value),
+            jnp.where(turn == 0, value, ends[-1]),
         )
 
     zero = jnp.zeros_like(step[0][0])
-    ends = (zero, zero + 1.0, zero, zero)
+    ends = (zero, zero + 1.0, zero, zero, zero)
     ends = jax.lax.fori_loop(0, _NUM_NARROWED, narrow, ends)
-    low, high, _, at_high = ends
-    share = low + (high - low) * jnp.clip(_secant(*ends[2:]), 0.0, 1.0)
-    return jnp.where(at_high <= 0.0, 1.0, share)
+    low, high, at_low, at_high, at_start = ends
+    share = low + (high - low) * jnp.clip(_secant(at_low, at_high), 0.0, 1.0)
+    # Where there was nothing to gain to begin with (joints turn in a substep, and what
+    # they do then does a little work; near the end there is nothing but rounding) the
+    # line tells nothing.
+    return jnp.where((at_high <= 0.0) | (at_start >= 0.0), 1.0, share)
 
 
 def _secant(at_low, at_high) -> Array:
