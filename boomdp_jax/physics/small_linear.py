@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 # Rows that are not worth finding out which of them are needed.
-_FEW_ROWS = 12
+_FEW_ROWS = 5
 
 
 def inverse3(a):
