@@ -28,6 +28,7 @@ from boomdp_jax.inference.fit_search import search_further
 from boomdp_jax.inference.fit_starts import Guesses, first_fits, grown_fits
 from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.noise_level import NUM_EACH, NoiseFit
+from boomdp_jax.inference.read_velocities import with_read_velocities
 from boomdp_jax.inference.target import StructureTarget
 
 # Rounds of noise, gains and fit.
@@ -78,10 +79,11 @@ def find_modes(
     """
     num_structures = targets.structures.shape[1]
     rng = host_generator(key)
-    guesses = Guesses.of(targets)
+    single = with_read_velocities(targets)
+    guesses = Guesses.of(single)
     report("fitting single steps")
-    fits, lack = _single_step_fits(rng, targets, guesses, settings)
-    noise = _first_noise(targets, best_of_each(fits, num_structures, 1))
+    fits, lack = _single_step_fits(rng, single, guesses, settings)
+    noise = _first_noise(single, best_of_each(fits, num_structures, 1))
     for number in range(_NUM_ROUNDS):
         report(f"fitting noise and filters, round {number + 1} of {_NUM_ROUNDS}")
         top = best_of_each(fits, num_structures, 1)
