@@ -24,6 +24,8 @@ _TITLES = {
     "viscous": "viscous friction",
     "dry": "dry friction limit",
 }
+# What a number does not say of itself.
+_NOTES = {("prismatic", "anchor_b"): " (a point of its line; where on it is agreed)"}
 _BODY_TITLES = {
     "center_of_mass": ("centre of mass", ["m", "m"]),
     "actuator.gain": ("actuator gain", [""]),
@@ -152,7 +154,8 @@ def _constraint_lines(constraints: list[dict]) -> list[str]:
         for key, summary in entry.items():
             if isinstance(summary, dict):
                 text = _quantity(summary, _units(entry["type"], key))
-                lines.append(f"    {_TITLES[key]:<20}{text}")
+                note = _NOTES.get((entry["type"], key), "")
+                lines.append(f"    {_TITLES[key]:<20}{text}{note}")
     return lines
 
 

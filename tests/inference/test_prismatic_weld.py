@@ -85,6 +85,7 @@ def test_a_drawer_s_axis_line_and_mass_are_found(posteriors):
     assert entry["axis"]["mean"] == pytest.approx(AXIS, abs=2e-3)
     assert entry["axis"]["identified"]
     assert entry["angle"]["mean"] == pytest.approx(POSE[2], abs=1e-3)
+    assert "a point of its line" in posteriors["drawer"].summary()
     across = np.array([-np.sin(AXIS), np.cos(AXIS)])
     arm = turned(POSE[2], np.array(entry["anchor_a"]["mean"]))
     off = np.array(entry["anchor_b"]["mean"]) - arm - POSE[:2]
