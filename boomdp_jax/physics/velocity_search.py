@@ -188,8 +188,9 @@ def _advanced(
     has_moved = (turn == 0) | ~is_whole | _has_moved(guess.twist, found.twist)
     if not is_early:
         share = _share(problem, turn, guess, found)
+        # The whole of it to the bit, as where it is known to be early.
         twist, impulse = jax.tree.map(
-            lambda old, new: old + share * (new - old),
+            lambda old, new: jnp.where(share == 1.0, new, old + share * (new - old)),
             (guess.twist, guess.impulse),
             (found.twist, found.impulse),
         )
