@@ -41,8 +41,9 @@ from boomdp_jax.physics.velocity_solve import (
 _NUM_LINES, _NUM_NARROWED = 12, 5
 # Relative change in the last iteration from which a lane counts as not settled.
 _UNSETTLED = 1e-3
-# Lanes from which none are taken out; else, when one in so many is left.
-_FEW, _ONE_IN, _AT_LEAST = 32, 8, 16
+# Lanes from which none are taken out (of 64 it gains a tenth, and takes longer to
+# compile); else, when one in so many is left.
+_FEW, _ONE_IN, _AT_LEAST = 128, 8, 16
 
 
 class _Search(NamedTuple):
