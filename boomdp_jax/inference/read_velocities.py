@@ -127,9 +127,7 @@ def _slopes(
         apart = (time[there] - time[here])[:, None, None]
         change = pose[there] - pose[here]
         change[..., 2] = np.arctan2(np.sin(change[..., 2]), np.cos(change[..., 2]))
-        terms = np.broadcast_arrays(
-            1.0, apart, apart**2, change, apart * change, subok=False
-        )
+        terms = np.broadcast_arrays(1.0, apart, apart**2, change, apart * change)
         counts = read[there] & read[here]
         sums[:, here] += np.where(counts, np.stack(terms), 0.0)
     num, once, twice, change, product = sums

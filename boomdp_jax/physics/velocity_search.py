@@ -46,6 +46,16 @@ _UNSETTLED = 1e-3
 _FEW, _ONE_IN, _AT_LEAST = 128, 8, 16
 
 
+class _Known(NamedTuple):
+    """What iterations do not change."""
+
+    problem: VelocityProblem
+    is_wanted: Bool[Array, " lane"]
+    """Where more than one iteration is."""
+    has_any: Bool[Array, " lane"]
+    """Where there is friction, a motor or a limit at all."""
+
+
 class _Search(NamedTuple):
     """Newton's method under way."""
 
@@ -112,6 +122,7 @@ def _search(problem: VelocityProblem, start: tuple) -> tuple:
     num = is_wanted.shape[-1]
     every = jnp.ones_like(is_wanted)
     search = _Search(guess, every, every)
+    known = _Known(problem, is_wanted, _has_any(problem))
     most_left = num // _ONE_IN if num > _FEW else 0
 
     def goes_on(carry):
@@ -121,29 +132,24 @@ def _search(problem: VelocityProblem, start: tuple) -> tuple:
 
     def go_on(carry):
         turn, search = carry
-        return turn + 1, _advanced(problem, is_wanted, turn, search, is_early=True)
+        return turn + 1, _advanced(known, turn, search, is_early=True)
 
     if num > _FEW:
         turn, search = jax.lax.while_loop(goes_on, go_on, (turn, search))
         search = few_at_a_time(
-            lambda known, search: _to_the_end(*known, turn, search),
+            lambda known, search: _to_the_end(known, turn, search),
             search.is_open,
-            (problem, is_wanted),
+            known,
             search,
             max(most_left, _AT_LEAST),
         )
     else:
-        search = _to_the_end(problem, is_wanted, turn, search)
+        search = _to_the_end(known, turn, search)
     found = search.found
     return (found.twist, found.impulse), (found.before, search.is_settled)
 
 
-def _to_the_end(
-    problem: VelocityProblem,
-    is_wanted: Bool[Array, " lane"],
-    turn: Array,
-    search: _Search,
-) -> _Search:
+def _to_the_end(known: _Known, turn: Array, search: _Search) -> _Search:
     """All iterations that are left."""
 
     def goes_on(carry):
@@ -153,24 +159,18 @@ def _to_the_end(
 
     def go_on(carry):
         turn, search = carry
-        return turn + 1, _advanced(problem, is_wanted, turn, search, is_early=False)
+        return turn + 1, _advanced(known, turn, search, is_early=False)
 
     return jax.lax.while_loop(goes_on, go_on, (turn, search))[1]
 
 
 def _advanced(
-    problem: VelocityProblem,
-    is_wanted: Bool[Array, " lane"],
-    turn: Array,
-    search: _Search,
-    *,
-    is_early: bool,
+    known: _Known, turn: Array, search: _Search, *, is_early: bool
 ) -> _Search:
     """One iteration.
 
     Args:
-        problem: momenta, frictions and joint rows.
-        is_wanted: where more than one iteration is.
+        known: all that does not change.
         turn: how many came before.
         search: after those.
         is_early: whether it is known to be one of the first `NUM_NEWTON`.
@@ -179,6 +179,7 @@ def _advanced(
         The search after it. Lanes that are done stay as they are, whatever the others
         do.
     """
+    problem, is_wanted, has_any = known
     last = guess = search.found
     dtype = problem.mass.dtype
     is_limited = jnp.where(turn > 0, 1.0, 0.0).astype(dtype)
@@ -202,7 +203,7 @@ def _advanced(
         for new, old in zip(found.twist, found.before, strict=True)
     )
     found = found._replace(before=(x, y, spin))
-    is_open, has_any = search.is_open, _has_any(problem)
+    is_open = search.is_open
     found = jax.tree.map(
         lambda new, old: jnp.where(is_open[None], new, old), found, last
     )
