@@ -4,8 +4,15 @@ In a drawer every point of a body moves alike, along the line. What rubs then mi
 well do so at the centre of mass, and the drawer's own friction is that of a wheel there
 that rolls along the line and does not hold across it. So a drawer is a body whose feet
 are at its centre of mass, with one more wheel, pushed along the line alone
-(`rail_params`): what `lone_step` solves without knowing of drawers. Before and after,
-the motion is put on the line; an angle that is off is set right, and a place by the
+(`rail_params`): what `lone_step` solves without knowing of drawers. A wheel of a body
+on a line is one more of that kind: with $u = (\cos\varphi, \sin\varphi)\,v$ for a line
+at $\varphi$ from its heading, the friction law of `friction` has along it
+
+$$f = -c\,v \min(1, |v|^{-1} / k), \quad c = c_r \cos^2\varphi + c_l \sin^2\varphi,
+\quad k^2 = (c_r \cos\varphi / d_r)^2 + (c_l \sin\varphi / d_l)^2,$$
+
+that of a wheel along the line with coefficient c and limit c / k. Before and after, the
+motion is put on the line; an angle that is off is set right, and a place by the
 shortest way.
 
 A weld, or a drawer whose body is pinned as well, leaves one pose and no twist.
@@ -13,6 +20,7 @@ A weld, or a drawer whose body is pinned as well, leaves one pose and no twist.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -42,13 +50,10 @@ class Rail(NamedTuple):
 def can_be_on_rail(params: Params) -> bool:
     """Whether this file knows the drawers and welds of a lone body."""
     guide, weld = params.prismatic, params.weld
-    has_drawer = guide is not None
     return (
         (guide is None or guide.active.shape[-1] <= 1)
         and (guide is None or (guide.limit is None and guide.motor is None))
         and (weld is None or weld.active.shape[-1] <= 1)
-        # Wheels would have to be held across the line.
-        and not (has_drawer and params.wheel.active.shape[-1])
     )
 
 
@@ -104,7 +109,8 @@ def rail_params(scene: Scene, params: Params) -> tuple[Scene, Params]:
 
     Returns:
         The scene with feet at the centre of mass where a drawer is active, and params
-        with its friction for a wheel, its pin inactive, and no drawers or welds.
+        with wheels there along its line, one more for its own friction, its pin
+        inactive, and no drawers or welds.
     """
     guide, ground, pin = params.prismatic, params.ground, params.revolute
     if guide is None or guide.active.shape[0] == 0:
@@ -120,7 +126,7 @@ def rail_params(scene: Scene, params: Params) -> tuple[Scene, Params]:
         params,
         revolute=_replaced(pin, active=pin.active & ~is_on),
         ground=ground,
-        wheel=_rail_wheel(guide),
+        wheel=_wheels_on_line(params.wheel, guide),
         prismatic=None,
         weld=None,
     )
@@ -160,20 +166,46 @@ def after_step(rail: Rail | None, motion: Motion) -> Motion:
     )
 
 
-def _rail_wheel(guide: Prismatic) -> Wheel:
-    """A wheel at the centre of mass whose rolling is the slide of a drawer."""
-    zero = jnp.zeros_like(guide.viscous)
+def _wheels_on_line(wheel: Wheel, guide: Prismatic) -> Wheel:
+    """Wheels as a drawer leaves them where it is active, and its own friction as one.
 
-    def pair(rolling: Array) -> Array:
-        return jnp.stack([rolling, zero], axis=-1)[None]
-
-    return Wheel(
+    All roll along the line at the centre of mass, and do not hold across it.
+    """
+    is_on, heading = guide.active, guide.axis - guide.angle
+    sin, cos = sincos(heading[:, None] - wheel.heading)
+    way = jnp.stack([cos, sin], axis=-1)
+    along = jnp.sum(wheel.viscous * way**2, axis=-1)
+    is_limited = (wheel.dry > 0) & jnp.isfinite(wheel.dry)
+    share = wheel.viscous * way / jnp.where(is_limited, wheel.dry, 1.0)
+    square = jnp.sum(jnp.where(is_limited, share, 0.0) ** 2, axis=-1)
+    has_limit = square > 0
+    knee = jnp.sqrt(jnp.where(has_limit, square, 1.0))
+    limit = jnp.where(has_limit, along / knee, jnp.inf)
+    own = Wheel(
         active=guide.active[None],
         position=jnp.zeros((1, *guide.anchor_a.shape), guide.anchor_a.dtype),
-        heading=(guide.axis - guide.angle)[None],
-        viscous=pair(guide.viscous),
-        dry=pair(guide.dry),
+        heading=heading[None],
+        viscous=_rolling(guide.viscous)[None],
+        dry=_rolling(guide.dry)[None],
     )
+    half_track = wheel.half_track
+    if half_track is not None:
+        half_track = jnp.where(is_on, 0.0, half_track)
+        own = _replaced(own, half_track=jnp.zeros_like(own.heading))
+    held = Wheel(
+        active=wheel.active,
+        position=jnp.where(is_on, 0.0, wheel.position),
+        heading=jnp.where(is_on, heading, wheel.heading),
+        viscous=jnp.where(is_on, _rolling(along), wheel.viscous),
+        dry=jnp.where(is_on, _rolling(limit), wheel.dry),
+        half_track=half_track,
+    )
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), held, own)
+
+
+def _rolling(value: Array) -> Array:
+    """A coefficient of rolling, and none across."""
+    return jnp.stack([value, jnp.zeros_like(value)], axis=-1)
 
 
 def _replaced(module, **changes):

@@ -189,3 +189,96 @@ def test_gradients_are_finite_and_zero_where_a_slot_is_off():
         assert all(np.all(np.isfinite(slope)) for slope in slopes.values())
         total = sum(float(jnp.sum(jnp.abs(slope))) for slope in slopes.values())
         assert (total == 0.0) == is_zero
+
+
+def with_wheels(params, key, half_track):
+    """Two wheels, of which some are active, anywhere on the body."""
+    keys = iter(jax.random.split(key, 6))
+    more = empty_params(1, num_wheel=2).wheel
+    shape = more.viscous.shape
+    limit = jnp.exp(jax.random.normal(next(keys), shape))
+    is_viscous = jax.random.bernoulli(next(keys), 0.2, shape)
+    wheel = changed(
+        more,
+        active=jax.random.bernoulli(next(keys), 0.8, shape[:2]),
+        position=0.2 * jax.random.normal(next(keys), shape),
+        heading=3.0 * jax.random.normal(next(keys), shape[:2]),
+        viscous=jnp.exp(jax.random.normal(next(keys), shape) + 1.0),
+        dry=jnp.where(is_viscous, jnp.inf, limit),
+        half_track=jnp.full(shape[:2], half_track) if half_track else None,
+    )
+    return changed(params, wheel=wheel)
+
+
+@pytest.mark.parametrize("kind", ["prismatic", "weld", "revolute", None])
+@pytest.mark.parametrize("half_track", [None, 0.1], ids=["one contact", "a track"])
+def test_wheels_of_a_body_with_a_slot_for_a_drawer(paths, kind, half_track):
+    fast, general = paths
+    params, state, wrench = cases(kind)
+    keys = jax.random.split(jax.random.key(9), NUM_CASES)
+    params = jax.vmap(lambda p, key: with_wheels(p, key, half_track))(params, keys)
+    # Without a floor both paths weigh start and end of a step alike.
+    no_floor = changed(params.ground, active=jnp.zeros_like(params.ground.active))
+    params = changed(params, ground=no_floor)
+    dt = jnp.asarray(0.001)
+    found = np.asarray(fast(params, state, wrench, dt))
+    gap = np.abs(found - np.asarray(general(params, state, wrench, dt)))
+    worst = np.max(gap, axis=(1, 2, 3))
+    assert np.quantile(worst, 0.9) < 1e-6
+    assert np.max(worst) < 1e-3
+
+
+def test_a_wheel_across_its_line_holds_a_drawer_up_to_its_limit():
+    """Terminal speed and rest, from the law along the line by itself."""
+    turned, force = 0.5, 3.0
+    params = hypothesis(jax.random.key(3), "prismatic")
+    zero = jnp.zeros(1)
+    guide = changed(params.prismatic, viscous=zero, dry=zero)
+    off = changed(params.ground, active=jnp.zeros((1, 1), bool))
+    viscous, dry = np.array([2.0, 30.0]), np.array([1.0, 4.0])
+    wheel = changed(
+        empty_params(1, num_wheel=1).wheel,
+        active=jnp.ones((1, 1), bool),
+        position=jnp.full((1, 1, 2), 0.2),
+        heading=jnp.full((1, 1), AXIS - ANGLE + turned),
+        viscous=jnp.asarray(viscous)[None, None],
+        dry=jnp.asarray(dry)[None, None],
+    )
+    params = changed(params, prismatic=guide, ground=off, wheel=wheel)
+    direction = np.array([np.cos(AXIS), np.sin(AXIS)])
+    way = np.array([np.cos(turned), np.sin(turned)])
+    resistance = float(viscous @ way**2)
+    limit = resistance / float(np.linalg.norm(viscous * way / dry))
+    state = State(jnp.append(PLACE, ANGLE)[None], jnp.zeros((1, 3)))
+    for push in (0.5 * limit, limit + force):
+        wrench = jnp.asarray(np.append(push * direction, 0.0))[None, None]
+        wrenches = jnp.broadcast_to(wrench, (200, 1, 3))
+        end = rollout(SCENE, params, state, wrenches, dt=0.02)[0].twist[-1, 0]
+        mass = float(params.density[0] * SCENE.area[0])
+        free = (push - limit) / mass * 4.0
+        speed = push / resistance if push < limit else free
+        along = float(jnp.dot(end[:2], direction))
+        # It takes a moment until the limit is reached.
+        most = limit / resistance
+        assert along == pytest.approx(speed, rel=1e-6, abs=most * (push > limit))
+        assert float(end[2]) == 0.0
+
+
+def test_a_pinned_body_turns_as_far_with_slots_for_everything_else(paths):
+    """More than a radian a substep, where the general solver would lose energy."""
+    params, state, _ = cases("revolute")
+    keys = jax.random.split(jax.random.key(4), NUM_CASES)
+    params = jax.vmap(lambda p, key: with_wheels(p, key, None))(params, keys)
+    wheel = changed(params.wheel, active=jnp.zeros_like(params.wheel.active))
+    zero = jnp.zeros_like(params.revolute.dry)
+    pin = changed(params.revolute, viscous=zero, dry=zero)
+    off = changed(params.ground, active=jnp.zeros_like(params.ground.active))
+    params = changed(params, wheel=wheel, ground=off, revolute=pin)
+    arm = jax.vmap(lambda a: turn(ANGLE, a[0]))(pin.anchor_a)
+    spin = jnp.full(NUM_CASES, 12.0)
+    twist = jnp.stack([spin * arm[:, 1], -spin * arm[:, 0], spin], axis=1)
+    begun = State(state.pose, twist[:, None])
+    dt = jnp.asarray(0.2)
+    end = np.asarray(paths[0](params, begun, jnp.zeros((NUM_CASES, 1, 3)), dt))
+    np.testing.assert_allclose(end[:, -1, 0, 5], 12.0, rtol=1e-9)
+    np.testing.assert_allclose(end[:, -1, 0, 2], ANGLE + 12.0, rtol=1e-9)
