@@ -99,7 +99,8 @@ def infer_noise(
     while steps == 0 or (np.any(power < 1.0) and steps < _MAX_STEPS):
         is_under_way = power < 1.0
         if steps == 0:
-            found, size = first_step(rng, problem, draws, index, num_chains)
+            known = problem, draws, index, num_chains
+            found, size, problem = first_step(rng, *known)
             is_good = size > _GOOD_SHARE * structure[0].size
         else:
             found = further_step(rng, draws, power, num_chains)

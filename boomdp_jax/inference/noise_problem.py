@@ -22,6 +22,7 @@ from boomdp_jax.inference.fit import Fits, Host
 from boomdp_jax.inference.fit_noise import NoiseDensity
 from boomdp_jax.inference.noise_level import NoiseFit, log_noise_prior
 from boomdp_jax.inference.noise_proposal import NoiseProposal, best_of_groups, groups_of
+from boomdp_jax.inference.noise_rounds import NoiseRounds
 from boomdp_jax.inference.noise_transport import NoiseTransport
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.tempered_smc import times
@@ -85,7 +86,7 @@ class NoiseProblem:
         self,
         targets: StructureTarget,
         index: np.ndarray,
-        proposal: NoiseProposal,
+        rounds: NoiseRounds,
         transport: NoiseTransport | None,
         is_moved: np.ndarray,
     ):
@@ -94,7 +95,7 @@ class NoiseProblem:
         Args:
             targets: stacked along a leading object axis.
             index: object of each draw.
-            proposal: of the noise of each group.
+            rounds: proposals of the noise of each group.
             transport: of each group; None: no group has any.
             is_moved: whether a group makes use of it.
         """
@@ -103,7 +104,7 @@ class NoiseProblem:
         scale = np.asarray(likelihood.coordinates.scales.noise, float)
         self._scale = scale[index]
         self._host = Host.of(targets)
-        self._proposal, self._transport = proposal, transport
+        self._rounds, self._transport = rounds, transport
         self._is_moved = is_moved
 
     @classmethod
@@ -137,17 +138,22 @@ class NoiseProblem:
             density = NoiseDensity(targets, best_of_groups(draws, group))
             proposal = NoiseProposal.fit(rng, density, begin)
         vector = proposal.sample(rng, group)
+        rounds = NoiseRounds.of(proposal)
         is_moved = np.zeros(len(names), bool)
         if transport is not None:
             rows = _some_of_each(rng, group)
+            # How good noises are is the same in both, and would hide the difference.
+            noise = vector[rows], group[rows]
+            known = transport.log_marginal(*noise) - proposal.log_density(*noise)
+            known = np.where(np.isfinite(known), known, 0.0)
             sizes = []
             for choice in (is_moved, ~is_moved):
-                tried = cls(targets, index, proposal, transport, choice)
+                tried = cls(targets, index, rounds, transport, choice)
                 found = tried._given(draws, vector, group, rows)
-                sizes.append(_sizes(found.ratio, group[rows]))
+                sizes.append(_sizes(found.ratio - known, group[rows]))
             plain, moved = sizes
             is_moved = moved >= plain
-        problem = cls(targets, index, proposal, transport, is_moved)
+        problem = cls(targets, index, rounds, transport, is_moved)
         return problem, problem._given(draws, vector, group, np.arange(len(group)))
 
     @property
@@ -164,10 +170,39 @@ class NoiseProblem:
         return NoiseProblem(
             self._targets,
             self._index[rows],
-            self._proposal,
+            self._rounds,
             self._transport,
             self._is_moved,
         )
+
+    def with_further_round(
+        self, rng: np.random.Generator, draws: NoiseDraws
+    ) -> "NoiseProblem":
+        """The same with a proposal more, fitted to draws of some groups.
+
+        Args:
+            rng: source of randomness.
+            draws: with all the noises that these were given.
+        """
+        known = draws.vector, draws.ratio, draws.group
+        return NoiseProblem(
+            self._targets,
+            self._index,
+            self._rounds.further(rng, *known),
+            self._transport,
+            self._is_moved,
+        )
+
+    def of_rounds(self, draws: NoiseDraws, before: "NoiseProblem") -> NoiseDraws:
+        """Draws of an earlier round as what all rounds make of them.
+
+        Args:
+            draws: the list, none of which has moved.
+            before: what they were given their noise by.
+        """
+        known = draws.vector, draws.group
+        gain = self._log_proposal(*known) - before._log_proposal(*known)
+        return draws._replace(log_first=draws.log_first + gain)
 
     def move(
         self,
@@ -199,7 +234,7 @@ class NoiseProblem:
         if np.any(power < 1.0):
             found = evaluate_points(self._targets, self._index, draws.structure, z)
             first = found.log_density
-            first = first + self._proposal.log_density(vector, draws.group)
+            first = first + self._log_proposal(vector, draws.group)
         trial = trial._replace(log_first=first)
         gain = _tempered(trial, power) - _tempered(draws, power) + proposed.log_ratio
         is_accepted = np.log(rng.random(len(gain))) < gain
@@ -214,9 +249,9 @@ class NoiseProblem:
             rng: source of randomness.
             draws: the list, none of which has moved.
         """
-        vector = self._proposal.sample(rng, draws.group)
-        first = draws.log_first - self._proposal.log_density(draws.vector, draws.group)
-        first = first + self._proposal.log_density(vector, draws.group)
+        vector = self._rounds.latest.sample(rng, draws.group)
+        first = draws.log_first - self._log_proposal(draws.vector, draws.group)
+        first = first + self._log_proposal(vector, draws.group)
         return self._with_last(draws._replace(vector=vector, log_first=first))
 
     def _given(
@@ -225,12 +260,15 @@ class NoiseProblem:
         """Some draws with noise given them."""
         vector, group, draws = vector[rows], group[rows], draws.take(rows)
         none = np.zeros(len(rows))
-        first = draws.value + self._proposal.log_density(vector, group)
+        first = draws.value + self._log_proposal(vector, group)
         z = draws.z.astype(float)
         fresh = NoiseDraws(
             draws.structure, z, z, vector, group, first, none, none, rows, rows
         )
         return self.only(rows)._with_last(fresh)
+
+    def _log_proposal(self, vector: np.ndarray, group: np.ndarray) -> np.ndarray:
+        return self._rounds.whole.log_density(vector, group)
 
     def _with_last(self, draws: NoiseDraws) -> NoiseDraws:
         """With what follows from structure, coordinates and noise."""

@@ -3,7 +3,8 @@
 What a reading scatters by, noise of readings or of the motion may explain, and often
 each of them could: the peak with the one is not the only one. Fits therefore start
 anew where what a peak says is noise of velocity or spin readings is noise of the
-motion, and each peak is covered by a narrow component and by a wide one. Of short
+motion, and each peak is covered by a narrow component and by a wide one; a few lie
+where noise of one motion is too small to show. Of short
 recordings the density is far from normal: draws are weighed a few times over, and a
 component takes their mean and spread (adaptive importance sampling, Cappé et al. 2008).
 """
@@ -15,6 +16,7 @@ import numpy as np
 
 from boomdp_jax.inference.fit import Fits
 from boomdp_jax.inference.fit_noise import Density, NoisePeaks, climb_noise
+from boomdp_jax.inference.noise_components import NUM_COMPONENTS, fit_components
 from boomdp_jax.inference.noise_level import NUM_EACH, NoiseFit
 from boomdp_jax.inference.target import StructureTarget
 
@@ -29,8 +31,14 @@ _LEFT_TO_READINGS = 0.2
 # spread is a little widened, and above this share of the narrow component's variance.
 _NUM_ROUNDS, _NUM_DRAWS, _FITTED_SHARE = 3, 256, 0.6
 _WIDER, _LEAST_SPREAD = 1.3, 0.3
+# Of what is fitted to many draws: how much wider than they have it, and its share of
+# the proposal that it is mixed with.
+_LITTLE_WIDER, _LARGE_SHARE = 1.15, 0.75
 # Of a fit that begins near a peak.
 _FEW_ROUNDS, _FEW_DRAWS = 2, 128
+# How far below a peak, and how wide, in logarithms, a component for negligible noise of
+# the motion is (the prior's standard deviation), and the share of all these.
+_PLATEAU, _PLATEAU_SHARE = 2.0, 0.2
 # Least share of a peak, and distance at which two are one, in logarithms.
 _LEAST_SHARE, _SAME = 0.1, 0.5
 
@@ -77,8 +85,10 @@ class NoiseProposal(NamedTuple):
             rows = np.tile(names, len(starts))
             tries = NoiseFit.of_vector(starts.reshape(len(rows), -1))
             others = climb_noise(density, rows, tries, _NUM_ITERATIONS)
-        proposal = peaks = cls.of_peaks(first, others)
-        num = _FEW_DRAWS if is_near else _NUM_DRAWS
+        peaks = cls.of_peaks(first, others)
+        if not is_near:
+            peaks = peaks._with_plateaus()
+        proposal, num = peaks, _FEW_DRAWS if is_near else _NUM_DRAWS
         for _ in range(_FEW_ROUNDS if is_near else _NUM_ROUNDS):
             each = np.repeat(names, num)
             vector = proposal.sample(rng, each)
@@ -119,6 +129,87 @@ class NoiseProposal(NamedTuple):
             log_share,
             np.concatenate([self.center, center[:, None]], axis=1),
             np.concatenate([self.lower, lower[:, None]], axis=1),
+        )
+
+    def refitted(
+        self,
+        rng: np.random.Generator,
+        vector: np.ndarray,
+        log_weight: np.ndarray,
+        group: np.ndarray,
+    ) -> "NoiseProposal":
+        """Cover weighed draws, of which some groups may have none.
+
+        Args:
+            rng: source of randomness.
+            vector: `[draw, number]`.
+            log_weight: of each draw.
+            group: of each draw.
+
+        Returns:
+            For groups with draws of any weight, what is fitted to them, mixed with what
+            there was.
+        """
+        narrow = self.lower[:, 0]
+        least = np.linalg.inv(narrow @ np.swapaxes(narrow, 1, 2))
+        known = np.where(np.isfinite(log_weight), log_weight, -np.inf)
+        names = np.unique(group[np.isfinite(known)])
+        found = [
+            fit_components(rng, vector[group == g], known[group == g], least[g])
+            for g in names
+        ]
+        num = len(self.log_share), NUM_COMPONENTS
+        log_share, before = np.full(num, -np.inf), self.log_share.copy()
+        center = np.repeat(self.center[:, :1], num[1], axis=1)
+        lower = np.repeat(self.lower[:, :1], num[1], axis=1)
+        for g, fitted in zip(names, found, strict=True):
+            log_share[g] = np.log(_LARGE_SHARE * fitted.share)
+            before[g] += np.log1p(-_LARGE_SHARE)
+            center[g] = fitted.center
+            wider = _LITTLE_WIDER * fitted.covariance
+            lower[g] = np.linalg.cholesky(np.linalg.inv(wider))
+        return NoiseProposal(
+            np.concatenate([before, log_share], axis=1),
+            np.concatenate([self.center, center], axis=1),
+            np.concatenate([self.lower, lower], axis=1),
+        )
+
+    def mixed_with(self, other: "NoiseProposal", share: float) -> "NoiseProposal":
+        """What draws of two proposals follow, put together.
+
+        Args:
+            other: of the same groups.
+            share: of the draws that are of the other.
+        """
+        log_share = self.log_share + np.log1p(-share), other.log_share + np.log(share)
+        return NoiseProposal(
+            np.concatenate(log_share, axis=1),
+            np.concatenate([self.center, other.center], axis=1),
+            np.concatenate([self.lower, other.lower], axis=1),
+        )
+
+    def _with_plateaus(self) -> "NoiseProposal":
+        """With components for noise of the motion below anything that shows.
+
+        There a density is about as flat as its prior, and may have more than at a
+        peak; the other motion's noise then makes up for what this one was.
+        """
+        size = self.center.shape[-1]
+        motion = np.arange(size) % NUM_EACH >= 4
+        spread = np.linalg.inv(self.lower[:, 0] @ np.swapaxes(self.lower[:, 0], 1, 2))
+        is_free = motion[:, None] | motion[None]
+        spread = np.where(is_free, np.diag(np.where(motion, _PLATEAU**2, 1.0)), spread)
+        lower = np.linalg.cholesky(np.linalg.inv(spread))
+        ways = [(4,), (5,), (4, 5)]
+        fall = [_PLATEAU * np.isin(np.arange(size) % NUM_EACH, way) for way in ways]
+        center = self.center[:, :1] - np.stack(fall)
+        log_share = np.full(center.shape[:2], np.log(_PLATEAU_SHARE / len(ways)))
+        before = self.log_share + np.log1p(-_PLATEAU_SHARE)
+        lower = np.repeat(lower[:, None], len(ways), axis=1)
+        return NoiseProposal(
+            np.concatenate([before, log_share], axis=1),
+            np.concatenate([self.center, center], axis=1),
+            np.concatenate([self.lower, lower], axis=1),
         )
 
     @classmethod

@@ -2,10 +2,11 @@
 
 The first step is the hardest: coordinates and noise were drawn on their own, and of an
 object whose posterior bends few pairs may be any good. Where that is so each draw is
-given more noises, as long as draws come to count for more by it, their weights summed
-over noises, and the first resampling chooses among all: moves could part the copies of
-a few later only slowly. (That their number depends on the weights makes the evidence a
-little too small, by less the more draws there are: about one per cent with a thousand.)
+given more noises, of proposals fitted to what weights have shown (`noise_rounds`), as
+long as that changes for how many draws count, their weights summed over noises; and the
+first resampling chooses among all: moves could part the copies of a few later only
+slowly. (That their number depends on the weights makes the evidence a little too small,
+by less the more draws there are: about one per cent with a thousand.)
 """
 
 from typing import NamedTuple
@@ -23,7 +24,8 @@ from boomdp_jax.inference.tempered_smc import next_step, times
 # Share of the draws that weights of a step count for.
 _KEPT_SHARE = 0.5
 # Draws are given more noises until the first weights count for this share of them, as
-# long as each counts for so many times what they did, at most so many each.
+# long as that changes for how many they count by such a factor (for fewer, where what
+# was missed has only now been found), at most so many each.
 _ENOUGH_SHARE, _GROWTH, _MOST_NOISES = 0.25, 1.1, 8
 
 
@@ -44,7 +46,7 @@ def first_step(
     draws: NoiseDraws,
     index: np.ndarray,
     num_chains: int,
-) -> tuple[Resampled, np.ndarray]:
+) -> tuple[Resampled, np.ndarray, NoiseProblem]:
     """Resample for the first time, giving draws more noises where few are any good.
 
     Args:
@@ -55,8 +57,8 @@ def first_step(
         num_chains: of each object, one after the other in the list.
 
     Returns:
-        What was done, and draws that weights to the last density count for, `[object]`;
-        of draws with several noises their sums.
+        What was done; draws that weights to the last density count for, `[object]`, of
+        draws with several noises their sums; and the problem with the proposals of all.
     """
     num_objects = int(index[-1]) + 1
     num_draws = len(index) // num_objects
@@ -69,11 +71,18 @@ def first_step(
         if not asked.size:
             break
         rows = np.flatnonzero(np.isin(index, asked))
-        more = problem.only(rows).with_other_noise(rng, draws.take(rows))
+        latest = problem.with_further_round(
+            rng, _joined([part for i in asked for part in pools[i]])
+        )
+        for i in asked:
+            pools[i] = [latest.of_rounds(part, problem) for part in pools[i]]
+        problem = latest
+        firsts = _joined([pools[i][0] for i in asked])
+        more = problem.only(rows).with_other_noise(rng, firsts)
         for i in asked:
             pools[i].append(more.take(index[rows] == i))
             before, size[i] = size[i], _size(pools[i])
-            is_open[i] = size[i] > _GROWTH * before
+            is_open[i] = not before / _GROWTH < size[i] < _GROWTH * before
     chosen, steps, log_means = [], [], []
     for pool in pools:
         # Noises of a draw lie side by side, so that it is chosen as often as it should.
@@ -85,12 +94,11 @@ def first_step(
         places = _places(rng, log_weight, num_each)
         place, noise = np.divmod(places, len(pool))
         place = place + num_each * np.arange(num_chains)[:, None]
-        whole = NoiseDraws(*map(np.concatenate, zip(*pool, strict=True)))
-        chosen.append(whole.take((num_draws * noise + place).ravel()))
+        chosen.append(_joined(pool).take((num_draws * noise + place).ravel()))
         steps.append(step)
         log_means.append(_log_mean(log_weight))
-    joined = NoiseDraws(*map(np.concatenate, zip(*chosen, strict=True)))
-    return Resampled(joined, np.array(steps), np.array(log_means)), size
+    found = Resampled(_joined(chosen), np.array(steps), np.array(log_means))
+    return found, size, problem
 
 
 def further_step(
@@ -115,6 +123,11 @@ def further_step(
         places = _places(rng, log_weight, num_each)
         rows[i] = np.take_along_axis(rows[i], places, axis=1)
     return Resampled(draws.take(rows.ravel()), steps, log_mean)
+
+
+def _joined(parts: list[NoiseDraws]) -> NoiseDraws:
+    """One list after the other."""
+    return NoiseDraws(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _size(pool: list[NoiseDraws]) -> float:

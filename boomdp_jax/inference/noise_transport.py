@@ -26,7 +26,7 @@ import numpy as np
 from boomdp_jax.inference.draw_moves import wrapped
 from boomdp_jax.inference.draw_ridge import DrawRidge
 from boomdp_jax.inference.fit import Fits, Host, climb, normal_equations
-from boomdp_jax.inference.noise_expansion import NoiseExpansion
+from boomdp_jax.inference.noise_expansion import Laplace, NoiseExpansion
 from boomdp_jax.inference.noise_level import NoiseFit
 from boomdp_jax.inference.noise_proposal import NoiseProposal, best_of_groups
 from boomdp_jax.inference.noise_regression import NoiseRegression
@@ -80,17 +80,31 @@ class NoiseTransport:
             )
             for name in range(len(fits.z))
         ]
-        expansion = NoiseExpansion(targets, fits, self._place, start)
+        self._expansion = expansion = NoiseExpansion(targets, fits, self._place, start)
         expansion.reach_out(rng)
         known = np.arange(len(fits.z)), fits.z, gradient, matrix
         center, self._factor = expansion.tight(*known)
-        self._proposal = NoiseProposal.fit(rng, expansion, expansion.peak)
-        self._maps = self._learnt(rng, expansion, center)
+        proposal = NoiseProposal.fit(rng, expansion, expansion.peak)
+        each = np.repeat(np.arange(len(center)), _NUM_LEARNT)
+        vector = proposal.sample(rng, each)
+        found = expansion.laplace(each, vector)
+        log_weight = found.log_marginal - proposal.log_density(vector, each)
+        self._proposal = proposal.refitted(rng, vector, log_weight, each)
+        self._maps = self._learnt(center, each, vector, found, log_weight)
 
     @property
     def proposal(self) -> NoiseProposal:
         """Of the noise of each group."""
         return self._proposal
+
+    def log_marginal(self, vector: np.ndarray, group: np.ndarray) -> np.ndarray:
+        """About how probable noises are, but for a constant of each group.
+
+        Args:
+            vector: logarithms of each.
+            group: of each.
+        """
+        return self._expansion.laplace(group, vector).log_marginal
 
     def move(
         self, group: np.ndarray, z: np.ndarray, vector: np.ndarray
@@ -128,13 +142,22 @@ class NoiseTransport:
         return self._host.wrap(padded[:, :-1]), diagonal.sum(axis=1)
 
     def _learnt(
-        self, rng: np.random.Generator, expansion: NoiseExpansion, center: np.ndarray
+        self,
+        center: np.ndarray,
+        each: np.ndarray,
+        vector: np.ndarray,
+        found: Laplace,
+        log_weight: np.ndarray,
     ) -> list[NoiseRegression]:
-        """The map of each group as a function of its noise."""
-        each = np.repeat(np.arange(len(center)), _NUM_LEARNT)
-        vector = self._proposal.sample(rng, each)
-        found = expansion.laplace(each, vector)
-        log_weight = found.log_marginal - self._proposal.log_density(vector, each)
+        """The map of each group as a function of its noise.
+
+        Args:
+            center: mean of the tight coordinates of each group under fixed gains.
+            each: groups of noises, `_NUM_LEARNT` of each, one after the other.
+            vector: logarithms of each noise.
+            found: what each makes of its group.
+            log_weight: of each.
+        """
         factor = self._factor[each]
         shift = np.linalg.solve(factor, (found.mean - center[each])[..., None])
         stretch = np.linalg.solve(factor, found.factor)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import kstest, multivariate_t
+from scipy.stats import kstest, multivariate_normal, multivariate_t, norm
 
 from boomdp_jax.inference.chunking import (
     CHUNK_SIZE,
@@ -15,6 +15,7 @@ from boomdp_jax.inference.chunking import (
     max_chunks,
 )
 from boomdp_jax.inference.fit_noise import NoisePeaks
+from boomdp_jax.inference.noise_components import fit_components, truncated
 from boomdp_jax.inference.noise_level import NoiseFit
 from boomdp_jax.inference.noise_proposal import NoiseProposal
 
@@ -123,3 +124,90 @@ def test_peaks_that_are_the_same_are_covered_once():
     found = NoiseProposal.of_peaks(peaks, others)
     share = np.exp(found.log_share[0]).reshape(3, 2).sum(axis=1)
     np.testing.assert_allclose(share, [0.5, 0.0, 0.5])
+
+
+def test_components_are_those_that_draws_are_of():
+    rng = np.random.default_rng(4)
+    share, center = np.array([0.7, 0.3]), np.array([[0.0, 0.0], [6.0, -3.0]])
+    factor = np.array([[[1.0, 0.0], [0.8, 0.6]], [[0.5, 0.0], [0.0, 2.0]]])
+    which = rng.choice(2, 4000, p=[0.5, 0.5])
+    noise = rng.standard_normal((4000, 2))
+    values = center[which] + np.einsum("nij,nj->ni", factor[which], noise)
+    # As many draws of both; weights say how probable each is.
+    found = fit_components(rng, values, np.log(share[which]), 1e-6 * np.eye(2))
+    grid = np.stack(np.meshgrid(*[np.linspace(-8, 10, 60)] * 2), -1).reshape(-1, 2)
+
+    def density(shares, centers, covariances):
+        each = [
+            multivariate_normal(*known).pdf(grid)
+            for known in zip(centers, covariances, strict=True)
+        ]
+        return shares @ np.array(each)
+
+    covariance = factor @ np.swapaxes(factor, 1, 2)
+    # Of the variance of all a little is added to each.
+    middle = share @ center
+    apart = np.einsum("k,ki,kj->ij", share, center - middle, center - middle)
+    added = 0.02 * (np.einsum("k,kij->ij", share, covariance) + apart)
+    expected = density(share, center, covariance + added)
+    gap = np.abs(density(*found) - expected)
+    # Of the mass, what is not where it should be.
+    assert 0.5 * gap.sum() / expected.sum() < 0.08
+
+
+def test_no_draw_has_all_the_weight():
+    log_weight = np.zeros(10_000)
+    log_weight[3] = 50.0
+    weight = truncated(log_weight)
+    assert weight.sum() == pytest.approx(1.0)
+    np.testing.assert_allclose(weight[3], 1.0)
+    log_weight[3] = np.log(1000.0)
+    mean = 1.0999
+    expected = 100.0 * mean / (9999.0 + 100.0 * mean)
+    assert truncated(log_weight)[3] == pytest.approx(expected, rel=1e-6)
+
+
+def test_proposals_put_together_have_the_mean_of_their_densities(proposal):
+    rng = np.random.default_rng(6)
+    group = np.repeat([0, 1], 200)
+    vector = proposal.sample(rng, group)
+    other = proposal.refitted(rng, vector[:200], np.zeros(200), group[:200])
+    whole = proposal.mixed_with(other, 0.25)
+    densities = [p.log_density(vector, group) for p in (proposal, other, whole)]
+    one, two, both = np.exp(densities)
+    np.testing.assert_allclose(both, 0.75 * one + 0.25 * two, rtol=1e-9)
+    # Nothing was seen of the second group, which stays as it was.
+    np.testing.assert_allclose(two[200:], one[200:], rtol=1e-9)
+    assert np.any(np.abs(two[:200] / one[:200] - 1.0) > 0.1)
+
+
+@pytest.mark.parametrize("low", [4, 5])
+def test_noise_that_does_not_show_is_found_beside_a_peak(low):
+    """Of a table that was pushed 70 % was there, where no climb led."""
+    other = 9 - low
+    peak = np.array([-4.8, -2.2, -5.1, -3.4, -5.0, -5.0])
+    sd = np.array([0.08, 0.1, 0.08, 0.12, 0.3, 0.3])
+    sd[other] = 1.9
+    flat, wide = peak.copy(), sd.copy()
+    flat[low], flat[other] = peak[low] - 3.4, peak[other] + 2.3
+    wide[low], wide[other] = 2.4, 0.5
+
+    def density(rows, x):
+        parts = [(0.3, peak, sd), (0.7, flat, wide)]
+        each = [
+            np.log(share) + norm.logpdf(x, middle, width).sum(axis=-1)
+            for share, middle, width in parts
+        ]
+        return np.logaddexp(*each)
+
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        start = NoiseFit.of_vector(peak[None])
+        found = NoiseProposal.fit(rng, density, start)
+        group = np.zeros(4096, int)
+        vector = found.sample(rng, group)
+        log_weight = density(group, vector) - found.log_density(vector, group)
+        weight = np.exp(log_weight)
+        # Without components there a few draws have nearly all the weight.
+        assert weight.mean() == pytest.approx(1.0, abs=0.25)
+        assert weight.sum() ** 2 / np.sum(weight**2) > 0.05 * len(group)

@@ -4,11 +4,14 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from boomdp_jax.inference import noise_steps
 from boomdp_jax.inference.noise_problem import (
     NoiseDraws,
     NoiseProblem,
     effective_size,
 )
+from boomdp_jax.inference.noise_proposal import NoiseProposal
+from boomdp_jax.inference.noise_rounds import NoiseRounds
 from boomdp_jax.inference.noise_steps import first_step, further_step
 
 NUM_CHAINS, NUM_EACH = 4, 2048
@@ -28,6 +31,12 @@ class Normal(NoiseProblem):
 
     def only(self, rows):
         return Normal(self.index[rows])
+
+    def with_further_round(self, rng, draws):
+        return self
+
+    def of_rounds(self, draws, before):
+        return draws
 
     def with_other_noise(self, rng, draws):
         vector = rng.standard_normal(draws.vector.shape)
@@ -52,7 +61,7 @@ def stepped():
     problem = Normal(index)
     z = rng.standard_normal((len(index), 1))
     draws = problem.of(z, rng.standard_normal(z.shape), np.arange(len(index)))
-    return draws, first_step(rng, problem, draws, index, NUM_CHAINS)
+    return draws, first_step(rng, problem, draws, index, NUM_CHAINS)[:2]
 
 
 def test_draws_get_more_noises_where_few_are_any_good(stepped):
@@ -122,13 +131,68 @@ def test_more_noises_do_not_pass_for_more_draws():
     z = rng.standard_normal((len(index), 1))
     draws = problem.of(z, rng.standard_normal(z.shape), np.arange(len(index)))
     alone = effective_size(draws.ratio)
-    found, size = first_step(rng, problem, draws, index, NUM_CHAINS)
+    found, size, _ = first_step(rng, problem, draws, index, NUM_CHAINS)
     assert size[0] == pytest.approx(alone, rel=1e-6)
     # As long a step as with one noise each.
     one = further_step(rng, draws, np.zeros(1), NUM_CHAINS)
     assert found.step[0] == pytest.approx(one.step[0], rel=1e-6)
     num = [len(np.unique(step.draws.z)) for step in (found, one)]
     assert num[0] == pytest.approx(num[1], rel=0.05)
+
+
+class Missed(NoiseProblem):
+    """A third of the noise's mass is where its first proposal has one draw in 500.
+
+    Coordinates are standard normal, and say nothing of the noise.
+    """
+
+    def __init__(self, index, rounds):
+        self._index, self._rounds = index, rounds
+
+    def only(self, rows):
+        return Missed(self._index[rows], self._rounds)
+
+    def with_further_round(self, rng, draws):
+        known = draws.vector, draws.ratio, draws.group
+        return Missed(self._index, self._rounds.further(rng, *known))
+
+    def _with_last(self, draws):
+        vector = draws.vector
+        last = np.logaddexp(
+            np.log(2 / 3) + norm.logpdf(vector).sum(axis=1),
+            np.log(1 / 3) + norm.logpdf(vector, 3.5, 0.5).sum(axis=1),
+        )
+        last = last + LOG_WHOLE + norm.logpdf(draws.z[:, 0])
+        return draws._replace(log_last=last)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_further_proposals_find_what_the_first_one_missed(seed, monkeypatch):
+    # Until weights are so even that the first step is the last.
+    monkeypatch.setattr(noise_steps, "_ENOUGH_SHARE", 0.55)
+    rng = np.random.default_rng(seed)
+    index = np.zeros(NUM_CHAINS * 512, int)
+    first = NoiseProposal(
+        np.zeros((1, 1)), np.zeros((1, 1, 2)), 0.7 * np.eye(2)[None, None]
+    )
+    rounds = NoiseRounds.of(first)
+    z, vector = rng.standard_normal((len(index), 1)), first.sample(rng, index)
+    none = np.zeros(len(index))
+    start = norm.logpdf(z[:, 0]) + first.log_density(vector, index)
+    names = np.arange(len(index))
+    draws = NoiseDraws(index, z, z, vector, index, start, none, none, names, names)
+    problem = Missed(index, rounds)
+    draws = problem._with_last(draws)
+    before = effective_size(draws.ratio)
+    found, size, last = first_step(rng, problem, draws, index, NUM_CHAINS)
+    assert before < 0.25 * len(index) < 0.5 * len(index) < size[0]
+    assert last._rounds.num > 1
+    assert found.step[0] == pytest.approx(1.0)
+    share = np.mean(found.draws.vector[:, 0] > 2.0)
+    error = 4.0 / np.sqrt(0.25 * len(index))
+    assert share == pytest.approx(1 / 3, abs=0.5 * error)
+    evidence = np.exp(found.log_mean).mean()
+    assert evidence == pytest.approx(np.exp(LOG_WHOLE), rel=error)
 
 
 def test_objects_that_have_arrived_stay(stepped):
