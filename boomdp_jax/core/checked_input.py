@@ -188,3 +188,24 @@ def _any_array(name: str, values: Any) -> np.ndarray:
         raise ValueError(
             f"{name}: expected an array, got rows of unequal length"
         ) from error
+
+
+def check_positive_seconds(
+    where: str, dt: np.ndarray, is_right: np.ndarray | np.bool
+) -> None:
+    """Name the first length of a step that is none, and its row.
+
+    Args:
+        where: what the message begins with.
+        dt: one length, or one for each row [s].
+        is_right: whether each is one.
+
+    Raises:
+        ValueError: some are not.
+    """
+    if np.all(is_right):
+        return
+    place = int(np.argmin(np.ravel(is_right)))
+    row = f" in row {place}" if np.size(dt) > 1 else ""
+    wrong = np.ravel(dt)[place]
+    raise ValueError(f"{where}dt: expected positive seconds, got {wrong}{row}")

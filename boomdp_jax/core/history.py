@@ -10,6 +10,7 @@ from boomdp_jax.core.applied_force import wrench_at_reference
 from boomdp_jax.core.arrays import IntScalar, on_device
 from boomdp_jax.core.checked_input import (
     check_fits,
+    check_positive_seconds,
     episode_array,
     real_array,
     whole_number,
@@ -220,9 +221,7 @@ def _each_dt(dt: np.ndarray, num_rows: int) -> np.ndarray:
         )
     with np.errstate(over="ignore", under="ignore"):
         held = dt.astype(jax.dtypes.canonicalize_dtype(float))
-    is_right = np.isfinite(held) & (held > 0)
-    if not np.all(is_right):
-        raise ValueError(f"dt: expected positive seconds, got {dt[~is_right].flat[0]}")
+    check_positive_seconds("", dt, np.isfinite(held) & (held > 0))
     return np.broadcast_to(dt, (num_rows,))
 
 

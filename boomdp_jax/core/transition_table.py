@@ -7,7 +7,12 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Int
 
-from boomdp_jax.core.checked_input import check_real, episode_array, has_shape
+from boomdp_jax.core.checked_input import (
+    check_positive_seconds,
+    check_real,
+    episode_array,
+    has_shape,
+)
 from boomdp_jax.core.history import History, make_history
 
 _STATIC_TOLERANCE = 1e-3
@@ -201,9 +206,7 @@ def read_dt(
         return np.full(num_rows, default)
     shape = arrays["dt"].shape if "dt" in arrays else ()
     dt = read_array(arrays, "dt", source, (num_rows,) if shape else ())
-    if not np.all(np.isfinite(dt) & (dt > 0)):
-        wrong = dt[~(np.isfinite(dt) & (dt > 0))].flat[0]
-        raise ValueError(f"{source}: dt: expected positive seconds, got {wrong}")
+    check_positive_seconds(f"{source}: ", dt, np.isfinite(dt) & (dt > 0))
     return np.broadcast_to(dt, (num_rows,))
 
 

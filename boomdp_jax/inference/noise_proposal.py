@@ -266,10 +266,16 @@ class NoiseProposal(NamedTuple):
     def log_density(self, vector: np.ndarray, group: np.ndarray) -> np.ndarray:
         """Of noise `[draw, number]` for each of a list of groups."""
         size = vector.shape[1]
-        offset = vector[:, None] - self.center[group]
-        # lower lower^T is the precision.
-        scaled = np.einsum("ncji,ncj->nci", self.lower[group], offset)
-        square = np.sum(scaled**2, axis=-1)
+        square = np.empty((len(vector), self.center.shape[1]))
+        # Components one by one: factors of all, draw by draw, would be too much.
+        for name in np.unique(group):
+            rows = np.flatnonzero(group == name)
+            mine = vector[rows]
+            for c, (center, lower) in enumerate(
+                zip(self.center[name], self.lower[name], strict=True)
+            ):
+                # lower lower^T is the precision.
+                square[rows, c] = np.sum(((mine - center) @ lower) ** 2, axis=1)
         volume = np.log(np.diagonal(self.lower, axis1=-2, axis2=-1)).sum(axis=-1)
         half = 0.5 * (_FREEDOM + size)
         constant = math.lgamma(half) - math.lgamma(0.5 * _FREEDOM)

@@ -100,7 +100,10 @@ def test_episodes_of_whole_floats_are_kept():
         ({"state": np.full((5, 1, 6), 1e300)}, "state: .* fit float32, got .* row 0"),
         ({"action": np.full((5, 1, 3), 1e39)}, "action: .* fit float32, got .* body 0"),
         ({"dt": np.full(5, 1e39)}, "dt: expected positive seconds, got 1e"),
-        ({"dt": np.full(5, 1e-60)}, "dt: expected positive seconds, got 1e-60"),
+        (
+            {"dt": np.full(5, 1e-60)},
+            "dt: expected positive seconds, got 1e-60 in row 0",
+        ),
     ],
 )
 def test_what_overflows_in_the_cast_is_refused(changes: dict, message: str):

@@ -183,6 +183,10 @@ def _with(name: str, index: tuple, value: float) -> dict[str, np.ndarray]:
         (_with("state", (4, 0, 1), np.inf), r"state: expected finite readings.* row 4"),
         ({"dt": np.asarray(0.0)}, r"dt: expected positive seconds, got 0"),
         ({"dt": np.asarray(np.nan)}, r"dt: expected positive seconds, got nan"),
+        (
+            {"dt": np.where(np.arange(6) == 4, -0.1, 0.1)},
+            r"dt: expected positive seconds, got -0.1 in row 4",
+        ),
         ({"dt": np.full(4, 0.02)}, r"dt: expected shape \[6\], got \[4\]"),
         ({"episode": np.zeros(6)}, r"episode: expected whole numbers"),
         ({"episode": np.arange(6) * 2**33}, r"of 32 bit, got 8589934592"),
