@@ -28,6 +28,7 @@ from boomdp_jax.inference.posterior import Posterior, with_diagnostics
 from boomdp_jax.inference.residual import check_residuals
 from boomdp_jax.inference.robust_update import DEGREES_OF_FREEDOM
 from boomdp_jax.inference.sample import sample_blocks
+from boomdp_jax.inference.still import still_notes
 from boomdp_jax.inference.structure_draws import SampleSettings
 from boomdp_jax.inference.svi import run_svi
 from boomdp_jax.inference.touching import find_touching
@@ -228,7 +229,7 @@ def infer_batch(
         entries["degrees_of_freedom"] = OUTLIERS[outliers]
     posteriors = [with_diagnostics(posterior, (), entries) for posterior in posteriors]
     for index, (spec, history) in enumerate(zip(specs, histories, strict=True)):
-        more = unread_notes(spec, history)
+        more = [*unread_notes(spec, history), *still_notes(spec, history)]
         if outliers == "none":
             more += [*chosen.notes, *outlier_notes(spec, history)]
         posteriors[index] = _with_notes(posteriors[index], more)

@@ -1,0 +1,58 @@
+"""Bodies that nothing pushed and that did not move: what can be said of such."""
+
+import numpy as np
+
+from boomdp_jax.core.history import History
+from boomdp_jax.physics.scene_spec import SceneSpec
+
+# Readings of a run that it takes to say that a body did not move, and standard errors
+# by which its halves may differ, and velocities from zero.
+_FEWEST, _NUM_ERRORS = 6, 4.0
+
+
+def still_notes(spec: SceneSpec, history: History) -> list[str]:
+    """Notes about bodies at rest with nothing acting on them.
+
+    At the start of a run a body may have any velocity that its first reading allows.
+    That one without friction then stays where it is would be a coincidence, and one
+    with friction is the more probable, though nobody pushed it. Who put it there knows
+    better.
+
+    Args:
+        spec: the scene.
+        history: its readings.
+
+    Returns:
+        One line for each body.
+    """
+    rows = np.asarray(history.mask)
+    if not np.any(rows) or np.any(np.asarray(spec.scene.gravity) != 0.0):
+        return []
+    action = np.asarray(history.action)[rows]
+    is_pushed = np.any(action != 0.0, axis=(0, 2)) | np.asarray(spec.is_static)
+    state = np.where(history.state_mask, history.state, np.nan)[rows]
+    starts = np.flatnonzero(~np.asarray(history.is_chained)[rows])
+    return [
+        f"{spec.names[body]}: nothing pushed it and it did not move; what is said of "
+        "its constraints follows from how fast it might have been at first"
+        for body in np.flatnonzero(~is_pushed)
+        if all(_is_still(run[:, body]) for run in np.split(state, starts) if len(run))
+    ]
+
+
+def _is_still(run: np.ndarray) -> bool:
+    """Whether readings `[time, 6]` of one run are those of a body at rest."""
+    if len(run) < _FEWEST or np.isnan(run[:, :3]).any():
+        return False
+    half = len(run) // 2
+    first, last = run[:half], run[-half:]
+    pose = last[:, :3].mean(axis=0) - first[:, :3].mean(axis=0)
+    angle = np.angle(np.exp(1j * (run[:, 2] - run[0, 2])))
+    pose[2] = angle[-half:].mean() - angle[:half].mean()
+    spread = np.append(run[:, :2].std(axis=0), angle.std())
+    has_moved = np.abs(pose) > _NUM_ERRORS * np.sqrt(2.0 / half) * spread
+    twist = run[:, 3:]
+    twist = twist[:, ~np.isnan(twist).any(axis=0)]
+    limit = _NUM_ERRORS * twist.std(axis=0) / np.sqrt(len(run))
+    is_moving = np.abs(twist.mean(axis=0)) > limit
+    return not (np.any(has_moved) or np.any(is_moving))
