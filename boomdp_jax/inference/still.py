@@ -7,7 +7,7 @@ from boomdp_jax.physics.scene_spec import SceneSpec
 
 # Readings of a run that it takes to say that a body did not move, and standard errors
 # by which its halves may differ, and velocities from zero.
-_FEWEST, _NUM_ERRORS = 6, 4.0
+_FEWEST, _NUM_ERRORS = 6, 6.0
 
 
 def still_notes(spec: SceneSpec, history: History) -> list[str]:
