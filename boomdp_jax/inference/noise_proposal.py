@@ -174,14 +174,18 @@ class NoiseProposal(NamedTuple):
             np.concatenate([self.lower, lower], axis=1),
         )
 
-    def mixed_with(self, other: "NoiseProposal", share: float) -> "NoiseProposal":
+    def mixed_with(self, other: "NoiseProposal", share: np.ndarray) -> "NoiseProposal":
         """What draws of two proposals follow, put together.
 
         Args:
             other: of the same groups.
-            share: of the draws that are of the other.
+            share: of the draws of each group that are of the other, below one,
+                `[group]`.
         """
-        log_share = self.log_share + np.log1p(-share), other.log_share + np.log(share)
+        share = share[:, None]
+        with np.errstate(divide="ignore"):
+            theirs = other.log_share + np.log(share)
+        log_share = self.log_share + np.log1p(-share), theirs
         return NoiseProposal(
             np.concatenate(log_share, axis=1),
             np.concatenate([self.center, other.center], axis=1),

@@ -18,8 +18,9 @@ class NoiseRounds(NamedTuple):
     first: NoiseProposal
     latest: NoiseProposal
     whole: NoiseProposal
-    """All of them, each with an equal share."""
+    """All of them that a group had, each with an equal share."""
     num: int
+    """Most of them."""
 
     @classmethod
     def of(cls, first: NoiseProposal) -> "NoiseRounds":
@@ -33,7 +34,9 @@ class NoiseRounds(NamedTuple):
         log_weight: np.ndarray,
         group: np.ndarray,
     ) -> "NoiseRounds":
-        """With a proposal more, for groups that have any draws here.
+        """With a proposal more for groups that have any draws here.
+
+        These must have had all that there were, as the others of a batch need not.
 
         Args:
             rng: source of randomness.
@@ -43,6 +46,7 @@ class NoiseRounds(NamedTuple):
         """
         latest = self.first.refitted(rng, vector, log_weight, group)
         num = self.num + 1
-        return NoiseRounds(
-            self.first, latest, self.whole.mixed_with(latest, 1.0 / num), num
-        )
+        # Draws of the others are of what they were.
+        has_more = np.isin(np.arange(len(self.first.log_share)), group)
+        whole = self.whole.mixed_with(latest, has_more / num)
+        return NoiseRounds(self.first, latest, whole, num)

@@ -18,6 +18,7 @@ from boomdp_jax.inference.fit_noise import NoisePeaks
 from boomdp_jax.inference.noise_components import fit_components, truncated
 from boomdp_jax.inference.noise_level import NoiseFit
 from boomdp_jax.inference.noise_proposal import NoiseProposal
+from boomdp_jax.inference.noise_rounds import NoiseRounds
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +173,7 @@ def test_proposals_put_together_have_the_mean_of_their_densities(proposal):
     group = np.repeat([0, 1], 200)
     vector = proposal.sample(rng, group)
     other = proposal.refitted(rng, vector[:200], np.zeros(200), group[:200])
-    whole = proposal.mixed_with(other, 0.25)
+    whole = proposal.mixed_with(other, np.array([0.25, 0.25]))
     densities = [p.log_density(vector, group) for p in (proposal, other, whole)]
     one, two, both = np.exp(densities)
     np.testing.assert_allclose(both, 0.75 * one + 0.25 * two, rtol=1e-9)
@@ -211,3 +212,17 @@ def test_noise_that_does_not_show_is_found_beside_a_peak(low):
         # Without components there a few draws have nearly all the weight.
         assert weight.mean() == pytest.approx(1.0, abs=0.25)
         assert weight.sum() ** 2 / np.sum(weight**2) > 0.05 * len(group)
+
+
+def test_rounds_of_one_group_leave_what_the_other_had_as_it_is(proposal):
+    rng = np.random.default_rng(7)
+    group = np.repeat([0, 1], 300)
+    vector = proposal.sample(rng, group)
+    start, log_weight = NoiseRounds.of(proposal), -0.5 * np.sum(vector**2, axis=1)
+    both = start.further(rng, vector, log_weight, group)
+    one = both.further(rng, vector[:300], log_weight[:300], group[:300])
+    before, after = (r.whole.log_density(vector, group) for r in (both, one))
+    np.testing.assert_array_equal(after[300:], before[300:])
+    latest = one.latest.log_density(vector, group)
+    expected = 2.0 / 3.0 * np.exp(before) + np.exp(latest) / 3.0
+    np.testing.assert_allclose(np.exp(after[:300]), expected[:300], rtol=1e-9)
