@@ -210,7 +210,14 @@ def with_wheels(params, key, half_track):
     return changed(params, wheel=wheel)
 
 
-@pytest.mark.parametrize("kind", ["prismatic", "weld", "revolute", None])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "prismatic",
+        *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("weld", "revolute")),
+        pytest.param(None, marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.parametrize("half_track", [None, 0.1], ids=["one contact", "a track"])
 def test_wheels_of_a_body_with_a_slot_for_a_drawer(paths, kind, half_track):
     fast, general = paths
