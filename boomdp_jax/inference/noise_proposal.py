@@ -114,22 +114,13 @@ class NoiseProposal(NamedTuple):
         mean = np.einsum("gn,gni->gi", weight, vector)
         offset = vector - mean[:, None]
         spread = np.einsum("gn,gni,gnj->gij", weight, offset, offset)
-        narrow = self.lower[:, 0]
-        least = np.linalg.inv(narrow @ np.swapaxes(narrow, 1, 2))
-        spread = _WIDER * spread + _LEAST_SPREAD * least
+        spread = _WIDER * spread + _LEAST_SPREAD * self._first_spread
         lower = np.linalg.cholesky(np.linalg.inv(spread))
         is_found = np.isfinite(top[:, 0])
-        share = np.where(is_found, _FITTED_SHARE, 0.0)[:, None]
-        with np.errstate(divide="ignore"):
-            log_share = np.concatenate(
-                [np.log1p(-share) + self.log_share, np.log(share)], axis=1
-            )
         center = np.where(is_found[:, None], mean, self.center[:, 0])
-        return NoiseProposal(
-            log_share,
-            np.concatenate([self.center, center[:, None]], axis=1),
-            np.concatenate([self.lower, lower[:, None]], axis=1),
-        )
+        whole = np.zeros((len(center), 1))
+        fitted = NoiseProposal(whole, center[:, None], lower[:, None])
+        return self.mixed_with(fitted, np.where(is_found, _FITTED_SHARE, 0.0))
 
     def refitted(
         self,
@@ -150,29 +141,20 @@ class NoiseProposal(NamedTuple):
             For groups with draws of any weight, what is fitted to them, mixed with what
             there was.
         """
-        narrow = self.lower[:, 0]
-        least = np.linalg.inv(narrow @ np.swapaxes(narrow, 1, 2))
         known = np.where(np.isfinite(log_weight), log_weight, -np.inf)
-        names = np.unique(group[np.isfinite(known)])
-        found = [
-            fit_components(rng, vector[group == g], known[group == g], least[g])
-            for g in names
-        ]
-        num = len(self.log_share), NUM_COMPONENTS
-        log_share, before = np.full(num, -np.inf), self.log_share.copy()
-        center = np.repeat(self.center[:, :1], num[1], axis=1)
-        lower = np.repeat(self.lower[:, :1], num[1], axis=1)
-        for g, fitted in zip(names, found, strict=True):
-            log_share[g] = np.log(_LARGE_SHARE * fitted.share)
-            before[g] += np.log1p(-_LARGE_SHARE)
-            center[g] = fitted.center
-            wider = _LITTLE_WIDER * fitted.covariance
+        least, num = self._first_spread, len(self.log_share)
+        share = np.zeros(num)
+        log_share = np.full((num, NUM_COMPONENTS), -np.log(NUM_COMPONENTS))
+        center = np.repeat(self.center[:, :1], NUM_COMPONENTS, axis=1)
+        lower = np.repeat(self.lower[:, :1], NUM_COMPONENTS, axis=1)
+        for g in np.unique(group[np.isfinite(known)]):
+            mine = group == g
+            found = fit_components(rng, vector[mine], known[mine], least[g])
+            share[g], log_share[g] = _LARGE_SHARE, np.log(found.share)
+            center[g] = found.center
+            wider = _LITTLE_WIDER * found.covariance
             lower[g] = np.linalg.cholesky(np.linalg.inv(wider))
-        return NoiseProposal(
-            np.concatenate([before, log_share], axis=1),
-            np.concatenate([self.center, center], axis=1),
-            np.concatenate([self.lower, lower], axis=1),
-        )
+        return self.mixed_with(NoiseProposal(log_share, center, lower), share)
 
     def mixed_with(self, other: "NoiseProposal", share: np.ndarray) -> "NoiseProposal":
         """What draws of two proposals follow, put together.
@@ -200,21 +182,23 @@ class NoiseProposal(NamedTuple):
         """
         size = self.center.shape[-1]
         motion = np.arange(size) % NUM_EACH >= 4
-        spread = np.linalg.inv(self.lower[:, 0] @ np.swapaxes(self.lower[:, 0], 1, 2))
         is_free = motion[:, None] | motion[None]
-        spread = np.where(is_free, np.diag(np.where(motion, _PLATEAU**2, 1.0)), spread)
+        flat = np.diag(np.where(motion, _PLATEAU**2, 1.0))
+        spread = np.where(is_free, flat, self._first_spread)
         lower = np.linalg.cholesky(np.linalg.inv(spread))
         ways = [(4,), (5,), (4, 5)]
         fall = [_PLATEAU * np.isin(np.arange(size) % NUM_EACH, way) for way in ways]
         center = self.center[:, :1] - np.stack(fall)
-        log_share = np.full(center.shape[:2], np.log(_PLATEAU_SHARE / len(ways)))
-        before = self.log_share + np.log1p(-_PLATEAU_SHARE)
+        log_share = np.full(center.shape[:2], -np.log(len(ways)))
         lower = np.repeat(lower[:, None], len(ways), axis=1)
-        return NoiseProposal(
-            np.concatenate([before, log_share], axis=1),
-            np.concatenate([self.center, center], axis=1),
-            np.concatenate([self.lower, lower], axis=1),
-        )
+        others = NoiseProposal(log_share, center, lower)
+        return self.mixed_with(others, np.full(len(center), _PLATEAU_SHARE))
+
+    @property
+    def _first_spread(self) -> np.ndarray:
+        """Scale matrix of the first component, `[group, number, number]`."""
+        first = self.lower[:, 0]
+        return np.linalg.inv(first @ np.swapaxes(first, 1, 2))
 
     @classmethod
     def of_peaks(cls, first: NoisePeaks, others: NoisePeaks) -> "NoiseProposal":
