@@ -90,6 +90,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         warnings.showwarning = _show_warning  # ty: ignore[invalid-assignment]
         try:
             command.run(arguments)
+        except IsADirectoryError as error:
+            folder = error.filename
+            _complain(
+                f"{folder}: Is a directory; expected a file (of several recordings: "
+                f"{folder}/*.npz)"
+            )
+            return 2
         except OSError as error:
             message = error.strerror or str(error)
             _complain(f"{error.filename}: {message}" if error.filename else message)

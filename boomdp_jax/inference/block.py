@@ -79,7 +79,11 @@ def make_block(
         inferred = touching.inferred_in(spec, bodies)
     layout = block_layout(spec, bodies, inferred)
     rows, log_prior = structures(
-        layout, spec.unknown, options, is_loaded=spec.normal_gravity > 0
+        layout,
+        spec.unknown,
+        options,
+        is_loaded=spec.normal_gravity > 0,
+        source=spec.source,
     )
     trusted = history if freedom is None else without_isolated(history)
     poses = _poses(trusted, bodies)

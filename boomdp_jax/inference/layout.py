@@ -205,6 +205,7 @@ def structures(
     options: PriorOptions,
     *,
     is_loaded: bool = True,
+    source: str = "",
 ) -> tuple[np.ndarray, np.ndarray]:
     """Every structure that a block may have, and its prior.
 
@@ -220,6 +221,7 @@ def structures(
         is_loaded: whether the floor carries the bodies. What it does not carry has no
             wheel and no friction with it: such structures are listed, so that shapes do
             not depend on the load, with a probability of zero.
+        source: file of the scene, for messages.
 
     Returns:
         Active slots, `[structure, slot]`, and normalised log-probabilities.
@@ -232,15 +234,16 @@ def structures(
     for i, slot in enumerate(layout.slots):
         groups.setdefault((slot.kind, slot.body_a, slot.body_b), []).append(i)
     sizes = [len(group) + 1 for group in groups.values()]
+    where = f"{source}: unknown" if source else "unknown"
     if math.prod(sizes) > _MAX_STRUCTURES:
         raise ValueError(
-            f"unknown: {math.prod(sizes)} structures of a block of "
+            f"{where}: {math.prod(sizes)} structures of a block of "
             f"{layout.num_bodies} bodies; expected at most {_MAX_STRUCTURES}; lower "
             "the caps in 'unknown'"
         )
     if len(layout.slots) > _MAX_SLOTS:
         raise ValueError(
-            f"unknown: {len(layout.slots)} constraints of a block of "
+            f"{where}: {len(layout.slots)} constraints of a block of "
             f"{layout.num_bodies} bodies; expected at most {_MAX_SLOTS}; lower the "
             "caps in 'unknown'"
         )

@@ -33,8 +33,9 @@ def load_scene(path: str | os.PathLike) -> SceneSpec:
         value = json.loads(
             content.decode("utf-8-sig"),
             object_pairs_hook=_object_without_repeats,
-            parse_constant=_refuse_constant,
+            parse_constant=_NotFinite,
         )
+        found = _not_finite(value)
     except RecursionError as error:
         raise ValueError(f"{path}: expected JSON, got it nested too deep") from error
     except ValueError as error:
@@ -42,6 +43,9 @@ def load_scene(path: str | os.PathLike) -> SceneSpec:
         raise ValueError(
             f"{path}: expected JSON, got text that is not or is cut short ({message})"
         ) from error
+    if found is not None:
+        where, name = found
+        raise ValueError(f"{path}: {where}{name} is not a finite number")
     return scene_spec_from_dict(value, source=str(path))
 
 
@@ -66,5 +70,24 @@ def _object_without_repeats(pairs: list[tuple[str, object]]) -> dict[str, object
     return value
 
 
-def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name} is not a finite number")
+class _NotFinite(str):
+    """`NaN`, `Infinity` or `-Infinity`, which JSON does not have but Python reads."""
+
+
+def _not_finite(value: object) -> tuple[str, str] | None:
+    """Where the first such number is, as messages say it, and what it is."""
+    if isinstance(value, _NotFinite):
+        return "", value
+    inner: list[tuple[str, object]] = []
+    if isinstance(value, dict):
+        inner = [(f"{key}: ", each) for key, each in value.items()]
+    elif isinstance(value, list):
+        inner = [(f"[{number}]: ", each) for number, each in enumerate(value)]
+    for where, each in inner:
+        found = _not_finite(each)
+        if found is None:
+            continue
+        name = each.get("name") if isinstance(each, dict) else None
+        within = f"{name!r}: " if isinstance(name, str) else where
+        return within + found[0], found[1]
+    return None

@@ -76,6 +76,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("infer data.npz --scene broken.json", "broken.json: expected JSON"),
         ("infer data.npz --scene typo.json", "typo.json: body 'cart'"),
         ("infer scene.json --scene scene.json", "scene.json: expected an NPZ"),
+        (
+            "infer . --scene scene.json",
+            r".: Is a directory; expected a file (of several",
+        ),
         ("infer empty.npz --scene scene.json", "empty.npz: expected at least one row"),
         ("infer data.npz empty.npz --scene scene.json", "empty.npz: expected at least"),
         (

@@ -94,6 +94,14 @@ def test_too_many_structures_are_refused(num_bodies, unknown, what):
         listed(spec(num_bodies, unknown))
 
 
+def test_what_is_refused_is_named_with_its_file():
+    scene = spec(1, {"revolute": 50})
+    layout = block_layout(scene, (0,))
+    options = read_prior(scene.prior, scene.source)
+    with pytest.raises(ValueError, match=r"^room\.json: unknown: 50 constraints"):
+        structures(layout, scene.unknown, options, source="room.json")
+
+
 @pytest.mark.parametrize(
     ("prior", "message"),
     [

@@ -226,6 +226,21 @@ def test_what_is_no_scene_file_is_refused(tmp_path: Path, content: bytes, messag
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity"])
+def test_what_json_does_not_have_is_refused_where_it_stands(
+    tmp_path: Path, number: str
+):
+    path = tmp_path / "room.json"
+    scene = _scene()
+    name = scene["bodies"][0]["name"]
+    scene["bodies"][0]["density"] = "HERE"
+    path.write_text(json.dumps(scene).replace('"HERE"', number))
+    with pytest.raises(ValueError, match="is not a finite number") as caught:
+        load_scene(path)
+    where = f"{path}: bodies: {name!r}: density: {number} is not a finite number"
+    assert str(caught.value) == where
+
+
 def test_a_number_too_large_for_a_float_is_refused(tmp_path: Path):
     path = tmp_path / "room.json"
     path.write_text(json.dumps(_scene()).replace('"dt": 0.02', '"dt": 1e999'))
