@@ -7,9 +7,11 @@ readings the structure and all numbers are inferred, and compared with the truth
 1 mrad, 5 mm/s, 5 mrad/s); one reading of each instant (chained) or two (separate). The
 main cell, 50 transitions at standard noise, chained, has many more objects, for
 coverage; it is repeated in a second world with other laws of friction (contacts for
-wheels, joints for the floor).
+wheels, joints for the floor). `--poses-only` asks all of that where nobody reads
+velocities, as a camera does not.
 """
 
+import dataclasses
 import itertools
 import time
 
@@ -20,6 +22,7 @@ from _report import Reporter, parser_of
 from _scores import ObjectScore, score_object
 from numpyro.diagnostics import effective_sample_size, split_gelman_rubin
 
+from boomdp_jax.core.transition_table import TransitionTable
 from boomdp_jax.inference.infer import infer, infer_batch
 from boomdp_jax.interop.mjcf import RecordingLaws
 from boomdp_jax.interop.object_families import (
@@ -48,6 +51,9 @@ def main() -> None:
     parser.add_argument("--families", nargs="+", choices=FAMILIES, default=FAMILIES)
     parser.add_argument("--batch", type=int, default=24, help="objects in one call")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--poses-only", action="store_true", help="no velocities are read, anywhere"
+    )
     arguments = parser.parse_args()
     reporter = Reporter(arguments.out)
     if arguments.quick:
@@ -97,6 +103,9 @@ def make_objects(families, num_objects, num_rows, seed, *, laws=None) -> list[tu
 def run_cell(reporter, case, objects, level, is_chained, arguments) -> None:
     """Infer all objects of a cell, a batch in a call, and report family by family."""
     noise = level * np.array(READING_NOISE)
+    told = np.where(
+        [False, False, arguments.poses_only, arguments.poses_only], np.inf, noise
+    )
     scores, seconds, sampler = [], [], []
     batch = min(arguments.batch, len(objects))
     for begin in range(0, len(objects), batch):
@@ -107,6 +116,8 @@ def run_cell(reporter, case, objects, level, is_chained, arguments) -> None:
             rng = np.random.default_rng([arguments.seed, begin, place, is_chained])
             noisy = with_reading_noise(rng, table, noise, is_chained=is_chained)
             specs.append(hide(truth))
+            if arguments.poses_only:
+                noisy = without_velocities(noisy)
             histories.append(noisy.to_history())
         key = jax.random.key(arguments.seed + begin)
         start = time.perf_counter()
@@ -115,7 +126,7 @@ def run_cell(reporter, case, objects, level, is_chained, arguments) -> None:
         for (family, truth, table), posterior in zip(chosen, posteriors, strict=True):
             if len(scores) < len(objects):
                 sampler.append(sampler_numbers(posterior))
-                bound = log_mass_bound(truth, table, noise, is_chained=is_chained)
+                bound = log_mass_bound(truth, table, told, is_chained=is_chained)
                 scores.append(score_object(family, truth, posterior, bound))
     reporter.report(
         case=case,
@@ -130,6 +141,13 @@ def run_cell(reporter, case, objects, level, is_chained, arguments) -> None:
         report_recovery(reporter, f"{case}: {family}", mine)
     report_coverage(reporter, case, scores)
     report_sampler(reporter, case, sampler)
+
+
+def without_velocities(table: TransitionTable) -> TransitionTable:
+    """A recording of which poses alone were read."""
+    state, next_state = table.state.copy(), table.next_state.copy()
+    state[..., 3:] = next_state[..., 3:] = np.nan
+    return dataclasses.replace(table, state=state, next_state=next_state)
 
 
 def report_recovery(reporter, case: str, scores: list[ObjectScore]) -> None:

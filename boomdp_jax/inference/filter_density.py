@@ -23,6 +23,7 @@ from boomdp_jax.inference.kalman import (
     NoiseLevel,
     channel_scale,
     kick_scale,
+    neighbour_scale,
     start_factor,
     start_scale,
 )
@@ -70,7 +71,6 @@ def filter_density(
     at_first = start_factor(data.freedom) * scale
     unknown = start_scale(num_bodies)
     variance, kick = scale**2, kick_scale(noise.impulse).reshape(-1) ** 2
-    offsets = jnp.diag(scale).reshape(num, num_bodies, 6)
 
     def advance(carry, row):
         state, covariance, total = carry
@@ -83,6 +83,9 @@ def filter_density(
             covariance, miss, row.is_second * seen, variance, data.freedom
         )
         state = state + shift.reshape(state.shape)
+        offset = neighbour_scale(list(scale), list(jnp.diagonal(covariance)))
+        offset = jnp.stack(offset)
+        offsets = jnp.diag(offset).reshape(num, num_bodies, 6)
         points = jnp.concatenate([state[None], state[None] + offsets])
         images = predict(points, row.action, row.dt)
         state = images[0]
@@ -91,10 +94,10 @@ def filter_density(
         mask = row.last_mask.reshape(-1)
         if data.freedom is None:
             shift, covariance, last_density = move_and_correct(
-                covariance, rise, scale, kick, miss, mask, variance
+                covariance, rise, offset, kick, miss, mask, variance
             )
         else:
-            covariance = move(covariance, rise, scale, kick)
+            covariance = move(covariance, rise, offset, kick)
             shift, covariance, last_density = _correct(
                 covariance, miss, mask, variance, data.freedom
             )
@@ -121,7 +124,8 @@ def _density_of_one_body(
     at_first = list((start_factor(data.freedom) * scale) ** 2)
     unknown = list(start_scale(1) ** 2)
     variance, kick = list(scale**2), list(kick_scale(noise.impulse).reshape(-1) ** 2)
-    offsets = jnp.concatenate([jnp.zeros((1, 6)), jnp.diag(scale)])
+    # The estimate, and each neighbour that is moved along one channel.
+    is_moved = jnp.concatenate([jnp.zeros((1, 6)), jnp.eye(6)])
     num = range(6)
 
     def advance(carry, row):
@@ -140,13 +144,14 @@ def _density_of_one_body(
             variance,
         )
         state = [x + move for x, move in zip(state, shift, strict=True)]
-        points = [x + offsets[:, i] for i, x in enumerate(state)]
+        offset = neighbour_scale(list(scale), [lower[i][i] for i in num])
+        points = [x + offset[i] * is_moved[:, i] for i, x in enumerate(state)]
         images = predict_all(points, row)
         state = [image[0] for image in images]
         shift, lower, last_density = move_and_correct_channels(
             lower,
             [[image[k + 1] - image[0] for image in images] for k in num],
-            list(scale),
+            offset,
             kick,
             channel_differences(row.last, state),
             [row.last_mask[0, i] for i in num],

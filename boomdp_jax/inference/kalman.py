@@ -12,7 +12,10 @@ first reading with that reading's covariance. Särkkä (2013), Bayesian Filterin
 Smoothing, algorithm 5.4.
 
 The derivative is by differences of about the readings' noise, which averages over kinks
-finer than that (a foot that sticks or slips).
+finer than that (a foot that sticks or slips). Of a twist that is known less well than
+that, as where a track begins and nobody reads velocities, they are as large as what is
+not known: friction that stops whatever is slower than a reading's noise would else pass
+for one that stops all, and take away in one step what nobody knows.
 """
 
 import math
@@ -93,6 +96,22 @@ def kick_scale(impulse):
     return jnp.concatenate([rest, rest, rest, slow, slow, spin], axis=-1)
 
 
+def neighbour_scale(scale: list, variance: list) -> list:
+    """How far from an estimate its neighbours lie, channel by channel.
+
+    Args:
+        scale: noise of the readings.
+        variance: of the estimate.
+
+    Returns:
+        The noise; of twists the estimate's sd, where that is more.
+    """
+    return [
+        noise if number % 6 < 3 else jnp.sqrt(jnp.maximum(noise**2, square))
+        for number, (noise, square) in enumerate(zip(scale, variance, strict=True))
+    ]
+
+
 def start_scale(num_bodies: int):
     """Sd of every channel of a start that was not read, body by body."""
     return jnp.tile(jnp.asarray(_UNKNOWN_START), num_bodies)
@@ -131,7 +150,6 @@ class RowFilter:
         self._variance = jnp.diag(self._scale**2)
         self._kick = kick_scale(noise.impulse).reshape(-1)
         self._unknown = start_scale(num_bodies)
-        self._offsets = jnp.diag(self._scale).reshape(self._num, num_bodies, 6)
 
     def start(self) -> Estimate:
         """To begin with, before any row; the first one starts a track."""
@@ -151,9 +169,13 @@ class RowFilter:
         (state, covariance), first_gain, first_whitening, first_density = self._update(
             estimate, row.first, row.is_second * row.first_mask
         )
-        points = jnp.concatenate([state[None], state[None] + self._offsets])
+        offset = jnp.stack(
+            neighbour_scale(list(self._scale), list(jnp.diagonal(covariance)))
+        )
+        offsets = jnp.diag(offset).reshape(num, *state.shape)
+        points = jnp.concatenate([state[None], state[None] + offsets])
         images = self._predict(points, row.action, row.dt)
-        slope = (images[1:] - images[:1]).reshape(num, num).T / self._scale[None]
+        slope = (images[1:] - images[:1]).reshape(num, num).T / offset[None]
         spread = covariance + jnp.diag(self._kick**2)
         covariance = slope @ spread @ slope.T
         covariance = 0.5 * (covariance + covariance.T)

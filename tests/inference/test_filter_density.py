@@ -137,44 +137,112 @@ def pinned_box(rng: np.random.Generator, num_rows: int):
     return spec, make_history(noisy[:-1, None], action, noisy[1:, None], DT)
 
 
-@pytest.mark.slow
-def test_a_pinned_body_is_filtered_as_by_particles():
-    """A bootstrap particle filter, which takes no derivative and no normal density."""
-    num_rows, num_particles = 8, 100_000
-    spec, history = pinned_box(np.random.default_rng(7), num_rows)
-    data = track_data(history, (0,), True)
+NUM_PARTICLES = 100_000
+
+
+def by_particles(spec, history: History, twist_sd=None) -> list[float]:
+    """Log-densities by a bootstrap particle filter, of one track of one body.
+
+    It takes no derivative and no normal density.
+
+    Args:
+        spec: the scene, all of it known.
+        history: one track.
+        twist_sd: of the twist that it starts with, which is not read, and of those of
+            the particles there; None: it is read.
+    """
     scene, params = spec.scene, spec.params()
-    found = float(filter_density(scene, params, data, level()))
     scale = jnp.asarray(np.repeat(READING, [2, 1, 2, 1]))
 
     @jax.jit
     def advance(key, state, action):
-        kick = jax.random.normal(key, (num_particles, 1, 3))
+        kick = jax.random.normal(key, (NUM_PARTICLES, 1, 3))
         kick = kick * jnp.asarray(IMPULSE[[0, 0, 1]])[None, None]
         kicked = State(state[..., :3], state[..., 3:] + kick)
         return jax.vmap(lambda s: step(scene, params, s, action)[0].array)(kicked)
 
     totals = []
     for seed in range(4):
-        key = jax.random.key(seed)
-        start_key, key = jax.random.split(key)
-        noise = jax.random.normal(start_key, (num_particles, 1, 6))
+        start_key, key = jax.random.split(jax.random.key(seed))
+        noise = jax.random.normal(start_key, (NUM_PARTICLES, 1, 6))
         state = history.state[0][None] + noise * scale[None, None]
+        weight = jnp.zeros(NUM_PARTICLES)
+        if twist_sd is not None:
+            prior, near = jnp.asarray(twist_sd)[:, None, None]
+            unit = noise[..., 3:]
+            state = state.at[..., 3:].set(near * unit)
+            weight = 0.5 * unit**2 - 0.5 * (near * unit / prior) ** 2
+            weight = jnp.sum(weight + jnp.log(near / prior), axis=(1, 2))
         total = 0.0
-        for t in range(num_rows):
+        for t in range(history.capacity):
             key, move_key, pick_key = jax.random.split(key, 3)
             state = advance(move_key, state, history.action[t])
             miss = (history.next_state[t][None] - state) / scale[None, None]
-            each = -0.5 * jnp.sum(miss**2, axis=(1, 2)) - jnp.sum(jnp.log(scale))
-            each = each - 3.0 * jnp.log(2.0 * jnp.pi)
-            total += float(jax.nn.logsumexp(each) - jnp.log(num_particles))
+            each = -0.5 * miss**2 - jnp.log(scale * jnp.sqrt(2.0 * jnp.pi))[None, None]
+            each = jnp.where(history.next_state_mask[t][None], each, 0.0)
+            each = weight + jnp.sum(each, axis=(1, 2))
+            total += float(jax.nn.logsumexp(each) - jnp.log(NUM_PARTICLES))
+            weight = jnp.zeros(NUM_PARTICLES)
             cumulative = jnp.cumsum(jnp.exp(each - jnp.max(each)))
-            places = (jnp.arange(num_particles) + jax.random.uniform(pick_key)) / (
-                num_particles
+            places = (jnp.arange(NUM_PARTICLES) + jax.random.uniform(pick_key)) / (
+                NUM_PARTICLES
             )
             chosen = jnp.searchsorted(cumulative, places * cumulative[-1])
-            state = state[jnp.minimum(chosen, num_particles - 1)]
+            state = state[jnp.minimum(chosen, NUM_PARTICLES - 1)]
         totals.append(total)
+    return totals
+
+
+@pytest.mark.slow
+def test_a_pinned_body_is_filtered_as_by_particles():
+    spec, history = pinned_box(np.random.default_rng(7), 8)
+    data = track_data(history, (0,), True)
+    found = float(filter_density(spec.scene, spec.params(), data, level()))
+    totals = by_particles(spec, history)
     spread = np.std(totals, ddof=1)
     assert spread < 0.3
     np.testing.assert_allclose(found, np.mean(totals), atol=0.1 + 3.0 * spread)
+
+
+def box_on_a_floor(dry: float, *, is_pinned: bool = False, seed: int = 11):
+    """A box that lies on a floor and is pushed; poses alone are read."""
+    ground = {"type": "ground", "a": "box", "dry": dry}
+    spec, _ = pinned_box(np.random.default_rng(0), 1)
+    scene = spec.to_dict()
+    scene["constraints"] = [*scene["constraints"][: int(is_pinned)], ground]
+    # Seen from above: the floor carries it.
+    scene.pop("gravity", None)
+    spec = scene_spec_from_dict(scene, source="test")
+    rng = np.random.default_rng(seed)
+    now, num_rows = State(jnp.zeros((1, 3)), jnp.zeros((1, 3))), 12
+    rows = [np.asarray(now.array[0])]
+    action = np.tile(rng.normal(size=(1, 1, 3)) * [3.0, 3.0, 0.3], (num_rows, 1, 1))
+    action[:2] = 0.0
+    for t in range(num_rows):
+        now, _ = step(spec.scene, spec.params(), now, jnp.asarray(action[t]))
+        rows.append(np.asarray(now.array[0]))
+    scale = np.repeat(READING, [2, 1, 2, 1])
+    noisy = np.stack(rows) + scale * rng.normal(size=(num_rows + 1, 6))
+    noisy[:, 3:] = np.nan
+    return spec, make_history(noisy[:-1, None], action, noisy[1:, None], DT)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("is_pinned", "true_dry", "dry"),
+    [(False, 0.3, 0.3), (True, 0.3, 0.3), (False, 0.0, 0.04)],
+)
+def test_friction_takes_away_no_more_of_an_unread_twist_than_it_can(
+    is_pinned, true_dry, dry
+):
+    """From rest, which nobody knows of, friction holds whatever a push is less than."""
+    _, history = box_on_a_floor(true_dry, is_pinned=is_pinned)
+    spec, _ = box_on_a_floor(dry, is_pinned=is_pinned)
+    data = track_data(history, (0,), True)
+    found = float(filter_density(spec.scene, spec.params(), data, level()))
+    gained = extended_filter(spec.scene, spec.params(), data, level())
+    np.testing.assert_allclose(found, gained.log_likelihood, rtol=1e-9)
+    totals = by_particles(spec, history, ([1.0, 1.0, 3.0], [0.2, 0.2, 0.4]))
+    assert np.std(totals, ddof=1) < 0.6
+    # Its sd is 1 m/s, of which a step's friction takes 0.06 m/s at most.
+    np.testing.assert_allclose(found, np.mean(totals), atol=1.5)
