@@ -166,7 +166,9 @@ def counted_calls() -> Iterator[list[int]]:
         if program is filter_points._DENSITIES:
             structure, *_ = arguments[3]
             return int(arguments[2]) * structure.shape[1]
-        place = 4 if program is evaluate._PUSHED else 2
+        if program is evaluate._PUSHED:
+            return int(arguments[4]) * CHUNK_SIZE
+        place = 3 if program is evaluate._RESTARTED else 2
         return int(arguments[place]) * CHUNK_SIZE
 
     def counting(original: Callable[..., Any], each_row: Callable[[Any], int]):

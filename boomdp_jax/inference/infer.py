@@ -27,6 +27,7 @@ from boomdp_jax.inference.outliers import outlier_notes, without_isolated
 from boomdp_jax.inference.posterior import Posterior, with_diagnostics
 from boomdp_jax.inference.residual import check_residuals
 from boomdp_jax.inference.robust_update import DEGREES_OF_FREEDOM
+from boomdp_jax.inference.run_breaks import run_break_reasons
 from boomdp_jax.inference.sample import sample_blocks
 from boomdp_jax.inference.still import still_notes
 from boomdp_jax.inference.structure_draws import SampleSettings
@@ -232,7 +233,9 @@ def infer_batch(
         more = [*unread_notes(spec, history), *still_notes(spec, history)]
         if outliers == "none":
             more += [*chosen.notes, *outlier_notes(spec, history)]
-        posteriors[index] = _with_notes(posteriors[index], more)
+        broken = run_break_reasons(spec, history)
+        doubted = with_diagnostics(posteriors[index], broken)
+        posteriors[index] = _with_notes(doubted, more)
     seed = seed_of(key)
     return [dataclasses.replace(posterior, seed=seed) for posterior in posteriors]
 

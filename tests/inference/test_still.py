@@ -53,6 +53,17 @@ def test_one_that_moves_or_is_pushed_is_not(changes):
     assert still_notes(box_scene(), recorded(**changes)) == []
 
 
+@pytest.mark.parametrize("begins", [0, NUM // 2])
+def test_one_that_flies_past_a_camera_is_not(begins):
+    """Which reads no velocities; it may begin to move halfway."""
+    time = np.maximum(np.arange(NUM + 1) - begins, 0) * DT
+    run = np.column_stack([time, 0.0 * time, 0.0 * time])
+    run = run + NOISE[:3] * np.random.default_rng(0).standard_normal(run.shape)
+    run = np.column_stack([run, np.full((NUM + 1, 3), np.nan)])[:, None]
+    history = make_history(run[:-1], np.zeros((NUM, 1, 3)), run[1:], DT)
+    assert still_notes(box_scene(), history) == []
+
+
 def test_on_a_slope_rest_does_tell_something():
     shape = {"type": "box", "half_extents": SIZE}
     content = {"schema": "planar-scene-1", "dt": DT, "gravity": [0.0, -1.0]}

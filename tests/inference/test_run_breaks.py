@@ -1,0 +1,55 @@
+"""Rows that do not follow one another: where a posterior names them."""
+
+import numpy as np
+import pytest
+
+from boomdp_jax.core.history import make_history
+from boomdp_jax.inference.run_breaks import run_break_reasons
+from tests.inference.recordings import NOISE, box_scene, free_box
+
+
+def glued(seed: int, **changes):
+    """Three runs of a free box that count as one."""
+    rng = np.random.default_rng(seed)
+    history = free_box(rng, 60, num_episodes=3, **changes)
+    return make_history(history.state, history.action, history.next_state, history.dt)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("is_chained", [True, False])
+def test_rows_at_which_runs_were_put_together_are_named(seed, is_chained):
+    (reason,) = run_break_reasons(box_scene(), glued(seed, is_chained=is_chained))
+    assert reason.startswith("box: in rows 20, 40 it starts up to ")
+    assert "expected another 'episode' where another run begins" in reason
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("is_chained", [True, False])
+def test_runs_that_are_told_apart_are_in_order(seed, is_chained):
+    rng = np.random.default_rng(seed)
+    history = free_box(rng, 60, num_episodes=3, is_chained=is_chained)
+    assert run_break_reasons(box_scene(), history) == []
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("is_chained", [True, False])
+def test_noise_and_gross_errors_are_no_gaps(seed, is_chained):
+    """Of a body at rest, of which nothing but noise is seen."""
+    rng = np.random.default_rng(seed)
+    first = NOISE * rng.standard_normal((60, 6))
+    last = NOISE * rng.standard_normal((60, 6))
+    # One after the other they would be a gap.
+    first[rng.choice(15, size=2, replace=False) * 4, :3] += 1.0
+    last[rng.choice(15, size=2, replace=False) * 4 + 2, :3] += 1.0
+    if is_chained:
+        first[1:] = last[:-1]
+    history = make_history(first[:, None], np.zeros((60, 1, 3)), last[:, None], 0.02)
+    assert run_break_reasons(box_scene(), history) == []
+
+
+def test_what_was_not_read_is_no_gap():
+    history = glued(0)
+    state = np.array(history.state)
+    state[:, :, :3] = np.nan
+    partly = make_history(state, history.action, history.next_state, history.dt)
+    assert run_break_reasons(box_scene(), partly) == []
