@@ -19,6 +19,7 @@ from boomdp_jax.inference.assemble import assemble_posterior
 from boomdp_jax.inference.block import Block, make_block, stack_blocks
 from boomdp_jax.inference.compile_ahead import signature
 from boomdp_jax.inference.components import independent_blocks
+from boomdp_jax.inference.doubts import with_doubts, with_notes
 from boomdp_jax.inference.evidence_report import BlockResult
 from boomdp_jax.inference.fixed_structure import Structure, check_structure
 from boomdp_jax.inference.likelihoods import ChosenLikelihood, choose_likelihood
@@ -27,13 +28,10 @@ from boomdp_jax.inference.outliers import outlier_notes, without_isolated
 from boomdp_jax.inference.posterior import Posterior, with_diagnostics
 from boomdp_jax.inference.residual import check_residuals
 from boomdp_jax.inference.robust_update import DEGREES_OF_FREEDOM
-from boomdp_jax.inference.run_breaks import run_break_reasons
 from boomdp_jax.inference.sample import sample_blocks
-from boomdp_jax.inference.still import still_notes
 from boomdp_jax.inference.structure_draws import SampleSettings
 from boomdp_jax.inference.svi import run_svi
 from boomdp_jax.inference.touching import find_touching
-from boomdp_jax.inference.unread import unread_notes
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 METHODS = ("auto", "rj", "enumerate", "smc", "nuts", "svi", "laplace", "map")
@@ -212,7 +210,7 @@ def infer_batch(
                     progress_bar=progress,
                     **counts,
                 )
-                posteriors.append(_with_notes(found, missing[index]))
+                posteriors.append(with_notes(found, missing[index]))
         else:
             method = "rj" if method == "auto" else method
             posteriors = _infer_structures(
@@ -230,21 +228,12 @@ def infer_batch(
         entries["degrees_of_freedom"] = OUTLIERS[outliers]
     posteriors = [with_diagnostics(posterior, (), entries) for posterior in posteriors]
     for index, (spec, history) in enumerate(zip(specs, histories, strict=True)):
-        more = [*unread_notes(spec, history), *still_notes(spec, history)]
+        notes = []
         if outliers == "none":
-            more += [*chosen.notes, *outlier_notes(spec, history)]
-        broken = run_break_reasons(spec, history)
-        doubted = with_diagnostics(posteriors[index], broken)
-        posteriors[index] = _with_notes(doubted, more)
+            notes = [*chosen.notes, *outlier_notes(spec, history)]
+        posteriors[index] = with_doubts(posteriors[index], spec, history, notes)
     seed = seed_of(key)
     return [dataclasses.replace(posterior, seed=seed) for posterior in posteriors]
-
-
-def _with_notes(posterior: Posterior, notes: list[str]) -> Posterior:
-    if not notes:
-        return posterior
-    before = posterior.diagnostics.get("notes", [])
-    return with_diagnostics(posterior, (), {"notes": [*before, *notes]})
 
 
 def checked_options(

@@ -1,0 +1,35 @@
+"""What is said of a posterior besides what its own draws and filters tell."""
+
+from boomdp_jax.core.history import History
+from boomdp_jax.inference.lever_doubts import lever_reasons
+from boomdp_jax.inference.posterior import Posterior, with_diagnostics
+from boomdp_jax.inference.run_breaks import run_break_reasons
+from boomdp_jax.inference.still import still_notes
+from boomdp_jax.inference.unread import unread_notes
+from boomdp_jax.physics.scene_spec import SceneSpec
+
+
+def with_notes(posterior: Posterior, notes: list[str]) -> Posterior:
+    """The same with further notes, which cast no doubt on it."""
+    if not notes:
+        return posterior
+    before = posterior.diagnostics.get("notes", [])
+    return with_diagnostics(posterior, (), {"notes": [*before, *notes]})
+
+
+def with_doubts(
+    posterior: Posterior, spec: SceneSpec, history: History, notes: list[str]
+) -> Posterior:
+    """The same with what its scene and its readings give to think.
+
+    Args:
+        posterior: of the scene.
+        spec: the scene.
+        history: its readings.
+        notes: further ones.
+    """
+    reasons = [*run_break_reasons(spec, history), *lever_reasons(spec, posterior)]
+    if reasons:
+        posterior = with_diagnostics(posterior, reasons)
+    notes = [*unread_notes(spec, history), *still_notes(spec, history), *notes]
+    return with_notes(posterior, notes)
