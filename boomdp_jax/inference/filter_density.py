@@ -24,6 +24,7 @@ from boomdp_jax.inference.kalman import (
     channel_scale,
     kick_scale,
     neighbour_scale,
+    neighbour_scales,
     start_factor,
     start_scale,
 )
@@ -83,8 +84,7 @@ def filter_density(
             covariance, miss, row.is_second * seen, variance, data.freedom
         )
         state = state + shift.reshape(state.shape)
-        offset = neighbour_scale(list(scale), list(jnp.diagonal(covariance)))
-        offset = jnp.stack(offset)
+        offset = neighbour_scales(scale, jnp.diagonal(covariance))
         offsets = jnp.diag(offset).reshape(num, num_bodies, 6)
         points = jnp.concatenate([state[None], state[None] + offsets])
         images = predict(points, row.action, row.dt)
@@ -144,7 +144,9 @@ def _density_of_one_body(
             variance,
         )
         state = [x + move for x, move in zip(state, shift, strict=True)]
-        offset = neighbour_scale(list(scale), [lower[i][i] for i in num])
+        offset = [
+            scale[i] if i < 3 else neighbour_scale(scale[i], lower[i][i]) for i in num
+        ]
         points = [x + offset[i] * is_moved[:, i] for i, x in enumerate(state)]
         images = predict_all(points, row)
         state = [image[0] for image in images]

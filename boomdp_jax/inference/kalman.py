@@ -96,20 +96,23 @@ def kick_scale(impulse):
     return jnp.concatenate([rest, rest, rest, slow, slow, spin], axis=-1)
 
 
-def neighbour_scale(scale: list, variance: list) -> list:
-    """How far from an estimate its neighbours lie, channel by channel.
+def neighbour_scale(scale, variance):
+    """How far from an estimate its neighbours lie, along channels of a twist.
 
     Args:
         scale: noise of the readings.
         variance: of the estimate.
 
     Returns:
-        The noise; of twists the estimate's sd, where that is more.
+        The noise, or the estimate's sd where that is more.
     """
-    return [
-        noise if number % 6 < 3 else jnp.sqrt(jnp.maximum(noise**2, square))
-        for number, (noise, square) in enumerate(zip(scale, variance, strict=True))
-    ]
+    return jnp.sqrt(jnp.maximum(scale**2, variance))
+
+
+def neighbour_scales(scale, variance):
+    """The same for all channels, body by body; noise alone along those of poses."""
+    is_twist = np.arange(scale.shape[0]) % 6 >= 3
+    return jnp.where(is_twist, neighbour_scale(scale, variance), scale)
 
 
 def start_scale(num_bodies: int):
@@ -169,9 +172,7 @@ class RowFilter:
         (state, covariance), first_gain, first_whitening, first_density = self._update(
             estimate, row.first, row.is_second * row.first_mask
         )
-        offset = jnp.stack(
-            neighbour_scale(list(self._scale), list(jnp.diagonal(covariance)))
-        )
+        offset = neighbour_scales(self._scale, jnp.diagonal(covariance))
         offsets = jnp.diag(offset).reshape(num, *state.shape)
         points = jnp.concatenate([state[None], state[None] + offsets])
         images = self._predict(points, row.action, row.dt)
