@@ -3,6 +3,7 @@
 import argparse
 import importlib
 import math
+import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -83,6 +84,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments = _make_parser().parse_args(argv)
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 2
+    # Where a compiled program comes from disk, XLA complains at length that features
+    # which it gave it itself (`prefer-no-gather`) are not the machine's.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     importlib.import_module("boomdp_jax.core").keep_programs()
     command = importlib.import_module(f"boomdp_jax.cli.{arguments.command}")
     with warnings.catch_warnings():

@@ -1,5 +1,6 @@
 """The command line as a whole: arguments, exit status, one line on bad input."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -187,6 +188,26 @@ def test_the_module_runs_as_a_program(folder: Path):
     assert finished.stderr.splitlines() == [
         "boomdp_jax: error: the following arguments are required: --scene"
     ]
+
+
+def test_xla_is_told_to_be_quiet_before_it_is_there():
+    """Once it is loaded it does not ask again."""
+    program = (
+        "import os, sys; from boomdp_jax.cli.main import main; "
+        "assert 'jax' not in sys.modules; "
+        "main(['infer', 'none.npz', '--scene', 'none.json']); "
+        "assert 'jax' in sys.modules; print(os.environ['TF_CPP_MIN_LOG_LEVEL'])"
+    )
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("TF_")}
+    finished = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=Path(__file__).parents[2],
+        env=environment,
+    )
+    assert finished.stdout.split() == ["3"]
 
 
 def test_numbers_that_are_not_finite_become_null():
