@@ -16,7 +16,10 @@ two cores; `--quick` looks at two of the objects.
 
 # %% What to run
 import argparse
+import os
 import pathlib
+
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA, of programs from disk.
 
 import jax
 import numpy as np

@@ -20,7 +20,10 @@ for the friction says that it was not seen.
 
 # %% What to run
 import argparse
+import os
 import pathlib
+
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA, of programs from disk.
 
 import jax
 import numpy as np

@@ -16,7 +16,10 @@ these forces are, and ends of pushes that are right within a millimetre.
 
 # %% What to run
 import argparse
+import os
 import pathlib
+
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA, of programs from disk.
 
 import equinox as eqx
 import jax

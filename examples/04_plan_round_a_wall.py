@@ -17,8 +17,11 @@ quarter of the nodes.
 # %% What to run
 import argparse
 import json
+import os
 import pathlib
 import time
+
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA, of programs from disk.
 
 import jax
 import jax.numpy as jnp

@@ -15,7 +15,10 @@ with a smaller film.
 
 # %% What to run
 import argparse
+import os
 import pathlib
+
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA, of programs from disk.
 
 import jax.numpy as jnp
 import numpy as np
