@@ -20,8 +20,8 @@ _NEIGHBOURS = 3
 # Share of a body's readings, and how many, that are worth a warning. Normal noise
 # reaches `_FAR` once in 1e14 readings.
 _LEAST_SHARE, _LEAST = 0.005, 3
-# From the median distance of normal numbers to their sd.
-_TO_SD = 1.4826
+SD_OF_MEDIAN = 1.4826
+"""Standard deviation of normal numbers over the median of their distance from zero."""
 
 
 def isolated_readings(
@@ -87,7 +87,7 @@ def _far(
     from_left, from_right = value - left, value - right
     both = np.concatenate([from_left, from_right])
     with np.errstate(all="ignore"):
-        usual = _TO_SD * _nanmedian(np.abs(both))
+        usual = SD_OF_MEDIAN * _nanmedian(np.abs(both))
         from_left = np.where(np.isnan(from_left), from_right, from_left)
         from_right = np.where(np.isnan(from_right), from_left, from_right)
         least = np.minimum(np.abs(from_left), np.abs(from_right))

@@ -3,13 +3,12 @@
 import numpy as np
 
 from boomdp_jax.core.history import History
+from boomdp_jax.inference.outliers import SD_OF_MEDIAN
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 # Readings of a run that it takes to say that a body did not move, and standard errors
 # by which its halves may differ, and velocities from zero.
 _FEWEST, _NUM_ERRORS = 6, 6.0
-# Standard deviation over median of the absolute value, of a normal variable.
-_SD_OF_MEDIAN = 1.4826
 
 
 def still_notes(spec: SceneSpec, history: History) -> list[str]:
@@ -54,7 +53,7 @@ def _is_still(run: np.ndarray) -> bool:
     # Of the readings, not of the motion: it shows from one to the next.
     change = np.diff(np.column_stack([run[:, :2], angle]), axis=0)
     change = np.abs(change - np.median(change, axis=0))
-    spread = _SD_OF_MEDIAN * np.median(change, axis=0) / np.sqrt(2.0)
+    spread = SD_OF_MEDIAN * np.median(change, axis=0) / np.sqrt(2.0)
     has_moved = np.abs(pose) > _NUM_ERRORS * np.sqrt(2.0 / half) * spread
     twist = run[:, 3:]
     twist = twist[:, ~np.isnan(twist).any(axis=0)]

@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from boomdp_jax.core.arrays import on_device
 from boomdp_jax.core.history import History
+from boomdp_jax.inference.outliers import SD_OF_MEDIAN
 from boomdp_jax.inference.prior import read_prior
 from boomdp_jax.physics.body_spec import BodySpec
 from boomdp_jax.physics.scene import Scene
@@ -32,8 +33,6 @@ CONTACT_NUMBERS = ("friction", "restitution")
 
 # Noise of a distance, in sds, within which outlines may have touched.
 _NUM_SDS = 5.0
-# Sd of a normal per median of its absolute value.
-_OF_MEDIAN = 1.4826
 
 
 class Touching(NamedTuple):
@@ -160,7 +159,7 @@ def _noise(pose, seen, run, position: float, angle: float) -> Float[np.ndarray, 
     whole = seen[2:] & seen[1:-1] & seen[:-2] & (run[2:] == run[:-2])[:, None]
     for body in range(pose.shape[1]):
         if whole[:, body].any():
-            middle = _OF_MEDIAN * np.median(bend[whole[:, body], body], axis=0)
+            middle = SD_OF_MEDIAN * np.median(bend[whole[:, body], body], axis=0)
             out[body] = np.maximum(out[body], [max(middle[:2]), middle[2]])
     return out
 
