@@ -4,9 +4,10 @@ Every number of Φ is a smooth function of coordinates that are standard normal 
 (a direction: uniform over half a turn), so that the prior density of Φ is the
 push-forward of that simple one. Drawers and welds have as many coordinates as there are
 different ones: a drawer a direction, a distance across it and an angle, a weld a pose,
-from where the body was seen (`resting`). Coefficients are sampled relative to mass and
-weight: what a motion tells of them does not depend on the mass, and where only gravity
-acts the mass drops out exactly.
+from where the body was seen (`resting`); so is where a pin holds, and how long a rod is
+(`meeting`). Coefficients are sampled relative to mass and weight: what a motion tells
+of them does not depend on the mass, and where only gravity acts the mass drops out
+exactly.
 """
 
 from typing import NamedTuple
@@ -21,10 +22,10 @@ from boomdp_jax.core.arrays import on_device
 from boomdp_jax.inference.body_numbers import numbers_of, with_numbers
 from boomdp_jax.inference.contact_prediction import ContactScene
 from boomdp_jax.inference.layout import Layout, SlotKey
+from boomdp_jax.inference.meeting import meeting_frame, meeting_numbers
 from boomdp_jax.inference.prior import PriorScales
 from boomdp_jax.inference.resting import rest_numbers, rest_pose
 from boomdp_jax.physics.params import (
-    WORLD,
     Distance,
     Ground,
     Params,
@@ -61,6 +62,8 @@ class Surroundings(eqx.Module):
     [N]."""
     rest: Float[Array, "rest 4"]
     """Pose of `Layout.rests` and the way they moved most; see `rest_pose`."""
+    meeting: Float[Array, "meeting 4"]
+    """Where bodies of `Layout.meetings` were; see `meeting_frame`."""
     density: Float[Array, " body"]
     """Known density, NaN where it is to be inferred [kg/m²]."""
     known: dict[int, dict[str, Float[Array, "..."]]]
@@ -115,6 +118,7 @@ def surroundings(
     authored = (spec.bodies[i].pose for i in bodies)
     start = np.array([np.zeros(3) if pose is None else pose for pose in authored])
     rest = [rest_pose(slot, poses, start) for slot in layout.rests]
+    meeting = [meeting_frame(slot, poses, start) for slot in layout.meetings]
     return Surroundings(
         radius=on_device(radii),
         half_extents=on_device((highs - lows) / 2),
@@ -129,6 +133,7 @@ def surroundings(
         ),
         push=on_device(np.sqrt(np.where(square > 0, square, 1.0))),
         rest=on_device(np.reshape(rest, (-1, 4))),
+        meeting=on_device(np.reshape(meeting, (-1, 4))),
         density=on_device(
             [
                 np.nan if spec.bodies[i].density is None else spec.bodies[i].density
@@ -183,7 +188,6 @@ class _Body(NamedTuple):
 
     mass: Float[Array, ""]
     gyration: Float[Array, ""]
-    reach: Float[Array, ""]
     weight: Float[Array, ""]
 
 
@@ -240,7 +244,6 @@ class Coordinates(eqx.Module):
             _Body(
                 mass=density[i] * self.scene.area[i],
                 gyration=self.scene.gyration[i],
-                reach=around.radius[i] + around.spread[i],
                 weight=jnp.where(gravity > 0, gravity, _STANDARD_GRAVITY),
             )
             for i in range(num_bodies)
@@ -297,30 +300,31 @@ class Coordinates(eqx.Module):
         around, a = self.surroundings, slot.body_a
         z = z[slot.start :]
         body = bodies[a]
-        center = around.center[a] if slot.body_b == WORLD else jnp.zeros(2)
-        reach_b = body.reach if slot.body_b == WORLD else bodies[slot.body_b].reach
+        known = around.known.get(slot.known, {})
         numbers: dict = {}
-        if slot.kind in ("revolute", "distance"):
-            name = f"{slot.kind}.anchor"
-            numbers["anchor_a"] = body.reach * self._scaled(name, z[0:2])
-            numbers["anchor_b"] = center + reach_b * self._scaled(name, z[2:4])
+        if slot in self.layout.meetings:
+            numbers |= meeting_numbers(
+                slot,
+                z,
+                around.meeting[self.layout.meetings.index(slot)],
+                around.radius + around.spread,
+                around.center[a],
+                around.radius[a],
+                self.scales,
+                known,
+            )
+        elif slot in self.layout.rests:
+            rest = around.rest[self.layout.rests.index(slot)]
+            numbers |= rest_numbers(
+                slot.kind, z, rest, around.radius[a], self.scales, known
+            )
         if slot.kind == "revolute":
             arm = body.gyration + jnp.sum(numbers["anchor_a"] ** 2)
             rate = jnp.exp(self._scaled("revolute.viscous_rate", z[4]))
             share = jnp.exp(self._scaled("revolute.dry_share", z[5]))
             numbers["viscous"] = body.mass * arm * rate
             numbers["dry"] = body.mass * body.weight * jnp.sqrt(arm) * share
-        elif slot.kind == "distance":
-            numbers["length"] = body.reach * jnp.exp(
-                self._scaled("distance.length", z[4])
-            )
-        elif slot in self.layout.rests:
-            rest = around.rest[self.layout.rests.index(slot)]
-            known = around.known.get(slot.known, {})
-            numbers |= rest_numbers(
-                slot.kind, z, rest, around.radius[a], self.scales, known
-            )
-        if slot.kind == "prismatic":
+        elif slot.kind == "prismatic":
             rate = jnp.exp(self._scaled("prismatic.viscous_rate", z[3]))
             share = jnp.exp(self._scaled("prismatic.dry_share", z[4]))
             numbers["viscous"] = body.mass * rate

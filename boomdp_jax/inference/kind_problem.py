@@ -2,8 +2,11 @@
 
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from boomdp_jax.core.arrays import on_device
 from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.coordinates import Coordinates
 from boomdp_jax.inference.kind_coordinates import CoordinateModel
@@ -11,6 +14,7 @@ from boomdp_jax.inference.kind_objects import ObjectsAlone
 from boomdp_jax.inference.kind_prior import KindPrior
 from boomdp_jax.inference.kind_state import KindData
 from boomdp_jax.inference.layout import Layout
+from boomdp_jax.inference.meeting import met_at, rod_length
 from boomdp_jax.physics.params import WORLD
 
 PLACE_COORDINATES = {"revolute": (2, 3), "distance": (2, 3, 4)}
@@ -112,30 +116,35 @@ def settle(
     """
     if pose is None:
         return z
-    z = z.copy()
-    around, scales = coordinates.surroundings, coordinates.scales
-    reach = float(around.radius[0] + around.spread[0])
-    centre = np.asarray(around.center[0], float)
-    cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    turned = np.array([[cos, sin], [-sin, cos]])
-    for slot in coordinates.layout.slots + coordinates.layout.known_slots:
-        if slot.kind not in PLACE_COORDINATES or slot.body_b != WORLD:
-            continue
-        name = f"{slot.kind}.anchor"
-        middle, scale = float(scales.center[name]), float(scales.spread[name])
-        start = slot.start
-        on_body = reach * (middle + scale * z[:, start : start + 2])
-        point = pose[:2] + on_body @ turned
-        if slot.kind == "revolute":
-            offset = (point - centre) / reach
-            z[:, start + 2 : start + 4] = (offset - middle) / scale
-        else:
-            end = centre + reach * (middle + scale * z[:, start + 2 : start + 4])
-            length = np.maximum(np.hypot(*(point - end).T), 1e-9) / reach
-            name = f"{slot.kind}.length"
-            middle, scale = float(scales.center[name]), float(scales.spread[name])
-            z[:, start + 4] = (np.log(length) - middle) / scale
-    return z
+    layout, scales = coordinates.layout, coordinates.scales
+    around = coordinates.surroundings
+    radius, reach = around.radius[0], around.radius[0] + around.spread[0]
+    stood = on_device([*pose[:2], np.cos(pose[2]), np.sin(pose[2])])
+
+    def scaled(name: str, value):
+        return scales.center[name] + scales.spread[name] * value
+
+    def standard(name: str, value):
+        return (value - scales.center[name]) / scales.spread[name]
+
+    def settled(row):
+        for slot, frame in zip(layout.meetings, around.meeting, strict=True):
+            if slot.body_b != WORLD:
+                continue
+            own, start = row[slot.start :], slot.start
+            first = reach * scaled(f"{slot.kind}.anchor", own[0:2])
+            if slot.kind == "revolute":
+                off = (met_at(stood, first) - met_at(frame, first)) / radius
+                place = jnp.arcsinh(standard("revolute.offset", off))
+                row = row.at[start + 2 : start + 4].set(place)
+            else:
+                second = reach * scaled("distance.anchor", own[2:4]) + around.center[0]
+                now = rod_length(stood, first, second, radius)
+                ratio = jnp.log(now / rod_length(frame, first, second, radius))
+                row = row.at[start + 4].set(standard("distance.length", ratio))
+        return row
+
+    return np.array(jax.vmap(settled)(on_device(z)), float)
 
 
 def _log_shares(weights: tuple[float, ...]) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -113,9 +114,17 @@ class Layout(NamedTuple):
 
     @property
     def rests(self) -> tuple[SlotKey, ...]:
-        """Slots whose numbers are measured from where the bodies were seen."""
+        """Drawers and welds, measured from where the bodies were seen."""
+        return self._of_kinds(NEW_KINDS)
+
+    @property
+    def meetings(self) -> tuple[SlotKey, ...]:
+        """Pins and rods, measured from where the bodies were seen."""
+        return self._of_kinds(("revolute", "distance"))
+
+    def _of_kinds(self, kinds: Collection[str]) -> tuple[SlotKey, ...]:
         slots = sorted(self.slots + self.known_slots, key=lambda slot: slot.start)
-        return tuple(slot for slot in slots if slot.kind in NEW_KINDS)
+        return tuple(slot for slot in slots if slot.kind in kinds)
 
 
 def block_layout(

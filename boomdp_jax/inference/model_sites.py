@@ -19,17 +19,19 @@ from numpyro.distributions import constraints, transforms
 from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.body_numbers import number_scale
 from boomdp_jax.inference.layout import BODY_NUMBERS, BodyNumber, Layout, SlotKey
+from boomdp_jax.inference.meeting import anchor_scale
 from boomdp_jax.inference.prior import LOGARITHMIC
 from boomdp_jax.inference.slot_names import slot_names
 from boomdp_jax.physics.params import WORLD
 
-Link = Literal["identity", "log", "logit", "half_turn"]
+Link = Literal["identity", "log", "logit", "half_turn", "arcsinh"]
 
 
 class Site(NamedTuple):
     """One sample site; its `coordinates` are (link(value) - loc) / scale.
 
-    A direction's is brought to half a turn about zero.
+    A direction's is brought to half a turn about zero. With `arcsinh` the link comes
+    last: arcsinh((value - loc) / scale).
     """
 
     name: str
@@ -46,6 +48,10 @@ class Site(NamedTuple):
             return HalfTurn()
         if self.link == "log":
             return dist.LogNormal(self.loc, self.scale)
+        if self.link == "arcsinh":
+            spread: Any = dist.Normal(jnp.zeros_like(self.loc), 1.0)
+            steps = [Sinh(), transforms.AffineTransform(self.loc, self.scale)]
+            return dist.TransformedDistribution(spread, steps).to_event(self.loc.ndim)
         normal: Any = dist.Normal(self.loc, self.scale)
         if self.link == "logit":
             return dist.TransformedDistribution(normal, transforms.SigmoidTransform())
@@ -61,16 +67,38 @@ class Site(NamedTuple):
         elif self.link == "half_turn":
             turned = value - self.loc
             linked = value - math.pi * jnp.floor(turned / math.pi + 0.5)
-        return jnp.reshape((linked - self.loc) / self.scale, -1)
+        z = (linked - self.loc) / self.scale
+        return jnp.reshape(jnp.arcsinh(z) if self.link == "arcsinh" else z, -1)
 
     def from_coordinates(self, z: Float[Array, " dim"]) -> Array:
         """The value at coordinates of the whole block."""
-        linked = self.loc + self.scale * jnp.reshape(
-            z[jnp.asarray(self.coordinates)], self.loc.shape
-        )
+        own = jnp.reshape(z[jnp.asarray(self.coordinates)], self.loc.shape)
+        if self.link == "arcsinh":
+            own = jnp.sinh(own)
+        linked = self.loc + self.scale * own
         if self.link == "log":
             return jnp.exp(linked)
         return jax.nn.sigmoid(linked) if self.link == "logit" else linked
+
+
+class Sinh(transforms.ParameterFreeTransform):
+    """Hyperbolic sine."""
+
+    domain = constraints.real
+    codomain = constraints.real
+
+    def __call__(self, x: Array) -> Array:
+        """The value at x."""
+        return jnp.sinh(x)
+
+    def _inverse(self, y: Array) -> Array:
+        return jnp.arcsinh(y)
+
+    def log_abs_det_jacobian(
+        self, x: Array, y: Array, intermediates: Any = None
+    ) -> Array:
+        """Logarithm of cosh x."""
+        return jnp.logaddexp(x, -x) - math.log(2.0)
 
 
 class HalfTurn(dist.Distribution):
@@ -101,14 +129,14 @@ class HalfTurn(dist.Distribution):
 _NUMBERS: dict[str, tuple[tuple[str, str, int, int], ...]] = {
     "revolute": (
         ("anchor_a", "revolute.anchor", 0, 2),
-        ("anchor_b", "revolute.anchor", 2, 2),
+        ("offset", "revolute.offset", 2, 2),
         ("viscous_rate", "revolute.viscous_rate", 4, 1),
         ("dry_share", "revolute.dry_share", 5, 1),
     ),
     "distance": (
         ("anchor_a", "distance.anchor", 0, 2),
         ("anchor_b", "distance.anchor", 2, 2),
-        ("length", "distance.length", 4, 1),
+        ("length_ratio", "distance.length", 4, 1),
     ),
     "prismatic": (
         ("axis", "", 0, 1),
@@ -138,6 +166,13 @@ _NUMBERS: dict[str, tuple[tuple[str, str, int, int], ...]] = {
     ),
 }
 _LOGISTIC = ("wheel.viscous_ratio", "wheel.dry_ratio", "ground.torque_share")
+_WITH_TAILS = (
+    "revolute.offset",
+    "prismatic.offset",
+    "prismatic.angle",
+    "weld.offset",
+    "weld.angle",
+)
 
 
 def block_sites(block: Block, names: tuple[str, ...]) -> tuple[Site, ...]:
@@ -260,7 +295,8 @@ def _slot_sites(slot: SlotKey, name: str, coordinates: Any) -> list[Site]:
         elif entry in _LOGISTIC:
             link, loc, scale = "logit", center, spread
         else:
-            link, loc, scale = "identity", origin + unit * center, unit * spread
+            link = "arcsinh" if entry in _WITH_TAILS else "identity"
+            loc, scale = origin + unit * center, unit * spread
         if count > 1:
             loc, scale = (jnp.broadcast_to(value, (count,)) for value in (loc, scale))
         sites.append(Site(f"{name}.{field}", places, link, loc, scale))
@@ -281,9 +317,12 @@ def _origin_and_unit(
     a, b, around = slot.body_a, slot.body_b, coordinates.surroundings
     reach = around.radius + around.spread
     zero, one = jnp.zeros(()), jnp.ones(())
+    if slot.kind == "revolute" and field == "anchor_a":
+        frame = around.meeting[coordinates.layout.meetings.index(slot)]
+        return anchor_scale(slot, frame, reach)
     if field == "anchor_b":
         return (around.center[a], reach[a]) if b == WORLD else (zero, reach[b])
-    if field in ("anchor_a", "length"):
+    if field == "anchor_a":
         return zero, reach[a]
     if field == "angle":
         return around.rest[coordinates.layout.rests.index(slot), 2], one

@@ -47,9 +47,11 @@ class ObjectModel(eqx.Module):
     Sample sites, by body and constraint: `table.density` [kg/m²];
     `table.center_of_mass` [m], `table.actuator.gain`, `bias` [N, N, N m] and `delay`
     [s] where they are unknown;
-    `table.revolute.anchor_a`, `anchor_b` [m], `viscous_rate` [1/s], `dry_share`;
-    `table.distance.length` [m]; `table.prismatic.axis` [rad] (to be read modulo half a
-    turn), `offset` of the line from where the body was seen [m], `angle` [rad],
+    `table.revolute.anchor_a` [m], `offset` of the pin from where the readings have that
+    point [m], `viscous_rate` [1/s], `dry_share`; `table.distance.anchor_a`, `anchor_b`
+    [m], `length_ratio` to their distance at the first reading; `table.prismatic.axis`
+    [rad] (to be read modulo half a turn), `offset` of the line from where the body was
+    seen [m], `angle` [rad],
     `viscous_rate` [1/s], `dry_share`; `table.weld.offset` [m], `angle` [rad];
     `table.wheel.position` [m], `heading` [rad] (to be read modulo half a turn),
     `lateral_rate` [1/s], `lateral_limit`, `viscous_ratio`, `dry_ratio`, `half_track`
@@ -59,7 +61,8 @@ class ObjectModel(eqx.Module):
     `noise.position` [m], `noise.angle` [rad], `noise.velocity` [m/s], `noise.spin`
     [rad/s], one number per body, or the single `noise`.
 
-    Deterministic sites: `table.mass` [kg] and the coefficients in SI units,
+    Deterministic sites: `table.mass` [kg], `table.revolute.anchor_b` and
+    `table.distance.length` [m], and the coefficients in SI units,
     `table.revolute.viscous`, `table.wheel.viscous`, `table.ground.viscous`, `...dry`.
 
     The observed site `next_state`, `[time, body, 6]`, has the bodies in `bodies`.

@@ -29,20 +29,23 @@ DEFAULT_SCALES: dict[str, Scale] = {
     # Anchors, in units of body radius plus spread of the positions: normal.
     "revolute.anchor": Scale(0.0, 1.0),
     "distance.anchor": Scale(0.0, 1.0),
-    # In units of body radius plus spread of the positions: log-normal.
-    "distance.length": Scale(1.0, 1.0),
+    # How far a pin is from where the readings have its anchor, in units of body radius,
+    # with the tails of a hyperbolic sine. Narrow, because the likelihood takes where a
+    # run starts as given: see `meeting`. A rod's length over that between its anchors
+    # at the first reading: log-normal.
+    "revolute.offset": Scale(0.0, 0.01),
+    "distance.length": Scale(1.0, 0.1),
     # Of a drawer: its friction along the line, viscous over mass [1/s] and dry as a
     # share of the weight, log-normal; how far the line passes from the mean of the
     # observed positions, in units of body radius, and how far the angle is from the
-    # mean of the observed ones [rad], normal. Narrow, because the likelihood takes
-    # where a run starts as given, and a drawer has that line and that angle from there.
+    # mean of the observed ones [rad], both as a pin's offset.
     "prismatic.viscous_rate": Scale(0.1, 2.0),
     "prismatic.dry_share": Scale(0.03, 2.0),
-    "prismatic.offset": Scale(0.0, 0.1),
-    "prismatic.angle": Scale(0.0, 0.1),
+    "prismatic.offset": Scale(0.0, 0.01),
+    "prismatic.angle": Scale(0.0, 0.01),
     # Where a weld holds a body, likewise.
-    "weld.offset": Scale(0.0, 0.1),
-    "weld.angle": Scale(0.0, 0.1),
+    "weld.offset": Scale(0.0, 0.01),
+    "weld.angle": Scale(0.0, 0.01),
     # Wheel position in units of the outline's half extents: normal.
     "wheel.position": Scale(0.0, 0.7),
     # Lateral viscous coefficient over mass [1/s] and lateral limit over weight.

@@ -4,9 +4,11 @@ Both hold a body's angle, a drawer keeps its centre of mass on a line, a weld at
 point. With the mean pose $(x_0, \theta_0)$ that was seen and the direction $\phi_0$ in
 which positions spread most (all against the partner), n across the axis,
 
-- drawer: axis $\phi_0 + z_0$, line through $x_0 + n s z_1$, angle
-  $\theta_0 + s' z_2$;
-- weld: place $x_0 + s\,(z_0, z_1)$, angle $\theta_0 + s' z_2$.
+- drawer: axis $\phi_0 + z_0$, line through $x_0 + n s \sinh z_1$, angle
+  $\theta_0 + s' \sinh z_2$;
+- weld: place $x_0 + s\,(\sinh z_0, \sinh z_1)$, angle $\theta_0 + s' \sinh z_2$
+
+(the hyperbolic sine for the reason given in `meeting`).
 
 The axis's range is cut across $\phi_0$, where no drawer that has moved lies: on the cut
 a line's distance would change its sign. Which of its points are the anchors is free;
@@ -92,14 +94,14 @@ def rest_numbers(
         number = known.get(name, jnp.full_like(value, jnp.nan))
         return jnp.where(jnp.isnan(number), value, number)
 
-    numbers = {"angle": given("angle", rest[2] + scaled("angle", z[2]))}
+    numbers = {"angle": given("angle", rest[2] + scaled("angle", jnp.sinh(z[2])))}
     if kind == "prismatic":
         axis = given("axis", rest[3] + z[0])
         numbers["axis"] = axis
         across = jnp.stack([-jnp.sin(axis), jnp.cos(axis)])
-        place = rest[:2] + radius * scaled("offset", z[1]) * across
+        place = rest[:2] + radius * scaled("offset", jnp.sinh(z[1])) * across
     else:
-        place = rest[:2] + radius * scaled("offset", z[0:2])
+        place = rest[:2] + radius * scaled("offset", jnp.sinh(z[0:2]))
     cos, sin = jnp.cos(numbers["angle"]), jnp.sin(numbers["angle"])
     # Where a scene gives the partner's anchor alone, the body's follows from it.
     x, y = given("anchor_b", place) - place

@@ -7,6 +7,7 @@ from jaxtyping import Array, Bool, Float
 from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.inference.coordinates import Coordinates
 from boomdp_jax.inference.layout import BODY_NUMBERS, SlotKey
+from boomdp_jax.inference.meeting import anchor_scale, met_at
 from boomdp_jax.inference.one_step import Readings
 from boomdp_jax.inference.prior import PriorScales
 from boomdp_jax.physics.params import WORLD
@@ -138,12 +139,13 @@ def _pin_seed(coordinates: Coordinates, data: Readings, slot: SlotKey, reach):
     around, scales = coordinates.surroundings, coordinates.scales
     padded = jnp.concatenate([reach, reach[slot.body_a][None]])  # WORLD is the last.
     first, second = pin_guess(data, slot.body_a, slot.body_b, padded)
-    if slot.body_b == WORLD:
-        second = second - around.center[slot.body_a]
+    frame = around.meeting[coordinates.layout.meetings.index(slot)]
+    middle, unit = anchor_scale(slot, frame, reach)
+    off = (second - met_at(frame, first)) / around.radius[slot.body_a]
     return jnp.concatenate(
         [
-            _standard(scales, "revolute.anchor", first / reach[slot.body_a]),
-            _standard(scales, "revolute.anchor", second / padded[slot.body_b]),
+            _standard(scales, "revolute.anchor", (first - middle) / unit),
+            jnp.arcsinh(_standard(scales, "revolute.offset", off)),
         ]
     )
 

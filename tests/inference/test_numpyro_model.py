@@ -89,8 +89,13 @@ def numbers(model, key, values=None):
 
 @pytest.fixture(scope="module")
 def prior(model):
+    return drawn(model, 4000)
+
+
+def drawn(model, num):
+    """Draws from the prior."""
     # Compiled, so that the physics, which is not asked for, is left out.
-    keys = jax.random.split(jax.random.key(0), 4000)
+    keys = jax.random.split(jax.random.key(0), num)
     return jax.jit(jax.vmap(lambda key: numbers(model, key)))(keys)
 
 
@@ -134,21 +139,25 @@ def test_prior_draws_follow_the_stated_distributions(prior):
         assert passes(prior[f"noise.{group}"][:, 0] ** 2, variance)
 
 
-def test_anchors_are_scaled_by_reach_about_the_centre_of_the_path(spec, prior):
+def test_pins_are_where_the_readings_have_their_anchors(spec, prior):
     history = pushed(spec)
-    places = np.concatenate([history.state, history.next_state])[:, 0, :2]
-    centre = places.mean(0)
-    spread = np.sqrt(((places - centre) ** 2).sum(-1).mean())
-    reach = np.hypot(0.2, 0.1) + spread
+    poses = np.concatenate([history.state, history.next_state])[:, 0, :3]
+    spread = np.sqrt(((poses[:, :2] - poses[:, :2].mean(0)) ** 2).sum(-1).mean())
+    radius = np.hypot(0.2, 0.1)
+    anchor_a = np.asarray(prior["table.revolute.anchor_a"])
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    turn = np.moveaxis(np.array([[cos, -sin], [sin, cos]]), -1, 0)
+    met = np.mean(poses[:, None, :2] + anchor_a @ turn.swapaxes(1, 2), axis=0)
+    off = np.asarray(prior["table.revolute.anchor_b"]) - met
+    np.testing.assert_allclose(off, prior["table.revolute.offset"], atol=1e-9)
     for axis in range(2):
-        anchor_a = prior["table.revolute.anchor_a"][:, axis]
-        anchor_b = prior["table.revolute.anchor_b"][:, axis]
-        assert passes(anchor_a, scipy.stats.norm(0, reach))
-        assert passes(anchor_b, scipy.stats.norm(centre[axis], reach))
-    rod = make_model(spec, history, {"table": ["distance"]})
-    (length,) = [site for site in rod.sites[0] if site.name.endswith("length")]
-    draws = length.prior.sample(jax.random.key(0), (4000,))
-    assert passes(draws, lognormal(reach, 1.0))
+        assert passes(anchor_a[:, axis], scipy.stats.norm(0, radius + spread))
+        assert passes(off[:, axis], scipy.stats.johnsonsu(0, 1, scale=0.01 * radius))
+    model = make_model(spec, history, {"table": ["distance"]})
+    rod = drawn(model, 2000)
+    end = np.asarray(rod["table.distance.anchor_a"]) @ turn[0].T + poses[0, :2]
+    gap = np.hypot(*np.transpose(end - rod["table.distance.anchor_b"]))
+    assert passes(rod["table.distance.length"] / gap, lognormal(1.0, 0.1))
 
 
 @pytest.mark.slow
@@ -337,7 +346,7 @@ def test_bodies_that_a_structure_does_not_tie_are_separate_blocks():
     assert [block.bodies for block in blocks] == [(0, 1), (2,)]
     model = make_model(spec, history, structure)
     names = [site.name for sites in model.sites for site in sites]
-    assert "cart.revolute_to_pole.anchor_b" in names
+    assert "cart.revolute_to_pole.offset" in names
     assert "box.wheel.heading" in names
     assert model.bodies == (0, 1, 2)
     drawn = jax.eval_shape(lambda key: numbers(model, key), jax.random.key(0))

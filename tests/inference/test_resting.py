@@ -63,8 +63,8 @@ def test_a_drawer_is_its_direction_its_line_and_its_angle():
     across = np.array([-np.sin(axis), np.cos(axis)])
     found = [
         axis - AXIS,
-        across @ (guide.anchor_b[0] - arm - POSE[:2]) / (0.1 * RADIUS),
-        (guide.angle[0] - POSE[2]) / 0.1,
+        np.arcsinh(across @ (guide.anchor_b[0] - arm - POSE[:2]) / (0.01 * RADIUS)),
+        np.arcsinh((guide.angle[0] - POSE[2]) / 0.01),
         np.log(guide.viscous[0] / mass / 0.1) / 2.0,
         np.log(guide.dry[0] / (mass * 9.81) / 0.03) / 2.0,
     ]
@@ -77,8 +77,8 @@ def test_a_weld_is_the_pose_of_its_body():
     weld = jax.tree.map(np.asarray, decode(block, z).weld)
     place = weld.anchor_b[0] - turned(weld.angle[0], weld.anchor_a[0])
     # Readings that differ by whole turns are of one angle.
-    found = [*(place - POSE[:2]) / (0.1 * RADIUS), (weld.angle[0] - POSE[2]) / 0.1]
-    np.testing.assert_allclose(found, z[part(block, "weld")], atol=1e-9)
+    off = [*(place - POSE[:2]) / (0.01 * RADIUS), (weld.angle[0] - POSE[2]) / 0.01]
+    np.testing.assert_allclose(np.arcsinh(off), z[part(block, "weld")], atol=1e-9)
 
 
 @pytest.mark.slow
@@ -146,8 +146,8 @@ def test_numbers_that_a_scene_gives_of_a_drawer_stay_and_the_line_is_one(given):
         axis = guide.axis[0]
         across = np.array([-np.sin(axis), np.cos(axis)])
         place = guide.anchor_b[0] - turned(guide.angle[0], guide.anchor_a[0])
-        offset = across @ (place - POSE[:2]) / (0.1 * RADIUS)
-        assert offset == pytest.approx(z[part(block, "prismatic")][1])
+        offset = across @ (place - POSE[:2]) / (0.01 * RADIUS)
+        assert np.arcsinh(offset) == pytest.approx(z[part(block, "prismatic")][1])
 
 
 def test_a_weld_with_a_null_angle_is_inferred_and_the_rest_is_given():
@@ -156,7 +156,7 @@ def test_a_weld_with_a_null_angle_is_inferred_and_the_rest_is_given():
     weld = decode(block, np.full(block.layout.dim, 0.5)).weld
     np.testing.assert_allclose(weld.anchor_b[0], [1.0, 2.0])
     np.testing.assert_allclose(weld.anchor_a[0], [0.1, 0.0])
-    assert float(weld.angle[0]) == pytest.approx(POSE[2] + 0.05)
+    assert float(weld.angle[0]) == pytest.approx(POSE[2] + 0.01 * np.sinh(0.5))
 
 
 @pytest.mark.slow
