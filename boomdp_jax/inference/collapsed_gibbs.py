@@ -22,10 +22,14 @@ from boomdp_jax.inference.kind_state import (
     log_label,
     log_structure,
 )
+from boomdp_jax.inference.kind_structures import restructure_kinds
 from boomdp_jax.inference.object_moves import Kinds, ObjectMove, draw_index
 
 # A nudge every so often, and how far it goes.
 _NUDGE_EVERY, _NUDGE_SHARE = 3, 0.4
+# Sweeps between proposals of new structures for a whole kind: they cost as much as the
+# rest of a sweep.
+_RESTRUCTURE_EVERY = 3
 # Common shifts of all objects of a kind in each sweep.
 _NUM_SHIFTS = 2
 
@@ -54,6 +58,8 @@ def sweep_collapsed(
     for _ in range(_NUM_SHIFTS):
         state = shift_kinds(rng, data, state)
     draw_spreads(rng, data, state)
+    if number % _RESTRUCTURE_EVERY == 0:
+        restructure_kinds(rng, data, state)
     accepted = np.ones(data.num_objects)
     is_nudge = number % _NUDGE_EVERY == _NUDGE_EVERY - 1
     for i in rng.permutation(data.num_objects).tolist():

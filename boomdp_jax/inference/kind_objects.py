@@ -19,9 +19,15 @@ from boomdp_jax.inference.block import Block, make_block, stack_blocks
 from boomdp_jax.inference.compile_ahead import signature
 from boomdp_jax.inference.evaluate import evaluate_points, log_prior_density
 from boomdp_jax.inference.find_modes import find_modes
+from boomdp_jax.inference.kind_axes import (
+    axis_turns,
+    measure_from_bodies,
+    turned_axes,
+)
 from boomdp_jax.inference.layout import Layout
 from boomdp_jax.inference.likelihood_bumps import Bumps
 from boomdp_jax.inference.likelihood_fit import fit_bumps
+from boomdp_jax.inference.noise_level import NoiseFit
 from boomdp_jax.inference.population import sample_population
 from boomdp_jax.inference.structure_draws import SampleSettings, start_mixtures
 from boomdp_jax.inference.target import StructureTarget
@@ -55,6 +61,8 @@ class ObjectsAlone(NamedTuple):
     bodies: tuple[BodyAlone, ...]
     targets: tuple[StructureTarget, ...]
     """Stacks of targets, on which likelihoods are evaluated."""
+    noise: tuple[NoiseFit, ...]
+    """Of every structure of every object of each stack, in order."""
     reach: float
     """How far anchors may lie beyond the outline, in radii: the same for all bodies, so
     that coordinates of one mean the same as those of another."""
@@ -100,7 +108,7 @@ def sample_alone(
 
     Raises:
         ValueError: a body is tied to another one, or differs from the others in what
-            constraints it may have; which one.
+            constraints it may have or in their prior; which one.
     """
     entries = []
     for scene, (spec, history) in enumerate(zip(specs, histories, strict=True)):
@@ -116,18 +124,22 @@ def sample_alone(
     _refuse_other_layouts(specs, entries)
     if reach is None:
         reach = _common_reach([block for *_, block, is_read in entries if is_read])
+    _refuse_other_scales(specs, entries)
     blocks = [_with_reach(block, reach) for _, _, block, _ in entries]
     groups: dict[object, list[int]] = {}
     for number, (*_, is_read) in enumerate(entries):
         if is_read:
             groups.setdefault(signature(blocks[number].target), []).append(number)
     found: dict[int, BodyAlone] = {}
-    stacks = []
+    stacks, noise = [], []
     for batch, members in enumerate(groups.values()):
         stacked = stack_blocks([blocks[number] for number in members])
         group_key = jax.random.fold_in(key, batch)
-        targets, several = _sample_group(group_key, stacked, settings, report)
+        layout = blocks[members[0]].layout
+        sampled = _sample_group(group_key, stacked, layout, settings, report)
+        targets, group_noise, several = sampled
         stacks.append(targets)
+        noise.append(group_noise)
         for place, number in enumerate(members):
             scene, body, _, _ = entries[number]
             target = jax.tree.map(lambda leaf, at=place: leaf[at], targets)
@@ -138,18 +150,22 @@ def sample_alone(
             )
     bodies = []
     for number, (scene, body, _, _) in enumerate(entries):
-        alone = BodyAlone(scene, body, specs[scene].names[body], blocks[number])
+        block = blocks[number]
+        target = measure_from_bodies(block.target, block.layout)
+        block = block._replace(target=target)
+        alone = BodyAlone(scene, body, specs[scene].names[body], block)
         bodies.append(found.get(number, alone))
-    return ObjectsAlone(tuple(bodies), tuple(stacks), reach)
+    return ObjectsAlone(tuple(bodies), tuple(stacks), tuple(noise), reach)
 
 
 def _sample_group(
     key: Key,
     targets: StructureTarget,
+    layout: Layout,
     settings: SampleSettings,
     report: Callable[[str], None],
-) -> tuple[StructureTarget, list[Bumps]]:
-    """Targets with the gains of filters, and the bumps of each body."""
+) -> tuple[StructureTarget, NoiseFit, list[Bumps]]:
+    """Targets with the gains of filters, noise, and the bumps of each body."""
     fit_key, chain_key = jax.random.split(key)
     found = find_modes(fit_key, targets, settings.fit, report)
     targets = found.targets
@@ -159,10 +175,18 @@ def _sample_group(
     draws, evidence = population.draws, population.evidence
     num_objects = targets.structures.shape[0]
     structure = np.asarray(draws.structure).reshape(num_objects, -1)
-    z = np.asarray(draws.z, float).reshape(*structure.shape, -1)
     slot, rows = np.asarray(targets.slot[0]), np.asarray(targets.structures[0])
     in_use = np.append(rows, np.ones((len(rows), 1), bool), axis=1)[:, slot]
-    modes = found.modes
+    modes, turn = found.modes, axis_turns(targets, layout)[:, None]
+
+    def turned(z):
+        return turned_axes(np.asarray(z, float), turn, layout)
+
+    z, _ = turned(np.reshape(draws.z, (*structure.shape, -1)))
+    weighed, _ = turned(evidence.z)
+    peak, sign = turned(modes.z)
+    precision = np.asarray(modes.precision, float) * sign[..., None, :]
+    precision = precision * sign[..., :, None]
     several = [
         fit_bumps(
             in_use,
@@ -172,19 +196,19 @@ def _sample_group(
             (structure[i], z[i]),
             (
                 np.asarray(evidence.structure[i]),
-                np.asarray(evidence.z[i], float),
+                weighed[i],
                 np.exp(np.asarray(evidence.log_weight[i], float)),
             ),
             (
                 np.asarray(modes.structure[i]),
-                np.asarray(modes.z[i], float),
-                np.asarray(modes.precision[i], float),
+                peak[i],
+                precision[i],
                 np.asarray(modes.log_density[i], float),
             ),
         )
         for i in range(num_objects)
     ]
-    return targets, several
+    return measure_from_bodies(targets, layout), found.noise, several
 
 
 def _moves(history: History, body: int, noise: np.ndarray) -> bool:
@@ -259,6 +283,29 @@ def _refuse_other_layouts(specs: Sequence[SceneSpec], entries: list) -> None:
                 f"({', '.join(_slot_kinds(first.layout)) or 'none'}); got "
                 f"{', '.join(_slot_kinds(block.layout)) or 'none'}"
             )
+
+
+def _refuse_other_scales(specs: Sequence[SceneSpec], entries: list) -> None:
+    """A coordinate is a number in units of its prior."""
+    first = prior_scales_of(entries[0][2])
+    for scene, _, block, _ in entries:
+        for name, scale in prior_scales_of(block).items():
+            if scale != first[name]:
+                raise ValueError(
+                    f"{specs[scene].source}: prior: {name}: expected the scale of all "
+                    f"scenes, {first[name]}; got {scale}: objects of a kind share "
+                    "numbers in units of their prior"
+                )
+
+
+def prior_scales_of(block: Block) -> dict[str, tuple[float, float]]:
+    """Centre and spread of every number, logarithms of those that are positive."""
+    likelihood: Any = block.target.log_likelihood
+    scales = likelihood.coordinates.scales
+    return {
+        name: (float(scales.center[name]), float(scales.spread[name]))
+        for name in scales.center
+    }
 
 
 def _around(block: Block) -> Any:

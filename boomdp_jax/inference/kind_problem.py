@@ -17,7 +17,12 @@ from boomdp_jax.inference.layout import Layout
 from boomdp_jax.inference.meeting import met_at, rod_length
 from boomdp_jax.physics.params import WORLD
 
-PLACE_COORDINATES = {"revolute": (2, 3), "distance": (2, 3, 4)}
+PLACE_COORDINATES = {
+    "revolute": (2, 3),
+    "distance": (2, 3, 4),
+    "prismatic": (1, 2),
+    "weld": (0, 1, 2),
+}
 """Coordinates of a joint to the world that belong to where the body stands and not to
 its kind, by their place in the slot; of a kind of constraint that is not listed: none.
 """
@@ -142,6 +147,12 @@ def settle(
                 now = rod_length(stood, first, second, radius)
                 ratio = jnp.log(now / rod_length(frame, first, second, radius))
                 row = row.at[start + 4].set(standard("distance.length", ratio))
+        for slot in layout.rests:
+            for place in PLACE_COORDINATES[slot.kind]:
+                is_angle = place == 2
+                name = f"{slot.kind}.{'angle' if is_angle else 'offset'}"
+                value = jnp.arcsinh(standard(name, 0.0))
+                row = row.at[slot.start + place].set(value)
         return row
 
     return np.array(jax.vmap(settled)(on_device(z)), float)

@@ -27,9 +27,11 @@ from boomdp_jax.inference.kind_chains import (
     run_kind_chains,
 )
 from boomdp_jax.inference.kind_features import number_labels, outline_features
+from boomdp_jax.inference.kind_noise import own_of_bodies
 from boomdp_jax.inference.kind_objects import (
     BodyAlone,
     ObjectsAlone,
+    prior_scales_of,
     resting_pose,
     sample_alone,
 )
@@ -39,8 +41,6 @@ from boomdp_jax.inference.kind_state import KindData, Tallies
 from boomdp_jax.inference.kinds_file import LearntKinds
 from boomdp_jax.inference.kinds_posterior import KindsPosterior
 from boomdp_jax.inference.noise import host_generator
-from boomdp_jax.inference.noise_scales import draw_noise_scales
-from boomdp_jax.inference.one_step import NOISE_SHAPE
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.sample import BlockDraws
 from boomdp_jax.inference.structure_chain import ChainDraws
@@ -97,8 +97,9 @@ def infer_kinds(
 
     Raises:
         TypeError: a key, scene, history, kinds or prior that are none.
-        ValueError: a body tied to another, or with other possible constraints than the
-            first; kinds learnt of other ones; an option that makes no sense.
+        ValueError: a body tied to another, or with other possible constraints or
+            another prior than the first; kinds learnt of other ones; an option that
+            makes no sense.
     """
     specs = [specs] if isinstance(specs, SceneSpec) else specs
     histories = [histories] if isinstance(histories, History) else histories
@@ -182,7 +183,7 @@ def infer_kinds_of(
     rng = host_generator(jax.random.fold_in(key, 0))
     before = {}
     if prior_kinds is not None:
-        before = _before(prior_kinds, data, settings.num_chains)
+        before = _before(prior_kinds, data, objects, settings.num_chains)
     draws = run_kind_chains(rng, data, settings, **before)
     kept = np.arange(0, draws.kind.shape[1], _stride(draws))
     has_before = prior_kinds is not None
@@ -204,6 +205,7 @@ def infer_kinds_of(
             labels=names,
             num_features=features.shape[1],
             reach=objects.reach,
+            scales=prior_scales_of(objects.bodies[0].block),
             prior=prior,
             versions=library_versions(),
         ),
@@ -239,7 +241,9 @@ def _check_options(prior_kinds, concentration, sampler, prior) -> None:
         check_kind_prior(prior)
 
 
-def _before(prior_kinds: LearntKinds, data: KindData, num_chains: int) -> dict:
+def _before(
+    prior_kinds: LearntKinds, data: KindData, objects: ObjectsAlone, num_chains: int
+) -> dict:
     """Kinds known before for each chain, with room for labels that are new."""
     tallies, num_features = prior_kinds.tallies, data.feature.shape[1]
     shape = (
@@ -251,6 +255,12 @@ def _before(prior_kinds: LearntKinds, data: KindData, num_chains: int) -> dict:
             f"prior_kinds: expected kinds of bodies that may have the same constraints "
             f"({data.dim} coordinates), got {', '.join(prior_kinds.slots) or 'none'}"
         )
+    for name, scale in prior_scales_of(objects.bodies[0].block).items():
+        if scale != prior_kinds.scales[name]:
+            raise ValueError(
+                f"prior_kinds: expected kinds learnt with the prior of {name} of the "
+                f"scenes, {scale}; got one with {prior_kinds.scales[name]}"
+            )
     chosen = np.arange(num_chains) % prior_kinds.num_draws
     columns = data.dim + num_features
     more = data.num_labels + 1 - tallies.label.shape[2]
@@ -292,7 +302,8 @@ def _posteriors(
     structure = draws.structure[:, kept].reshape(num_draws, -1)
     z = draws.z[:, kept].reshape(num_draws, structure.shape[1], -1).astype(dtype)
     log_joint = draws.log_joint[:, kept]
-    noise = _noise(jax.random.fold_in(key, 1), objects, structure, z)
+    rng = host_generator(jax.random.fold_in(key, 1))
+    each = own_of_bodies(rng, objects, structure, z)
     ordered = np.sort(draws.kind[:, kept], axis=2)
     num_kinds = 1.0 + np.sum(ordered[..., 1:] != ordered[..., :-1], axis=2)
     concentration = np.maximum(draws.concentration[:, kept], 1e-300)
@@ -324,14 +335,15 @@ def _posteriors(
             structure=structure[None, :, i],
             z=own[None],
             log_density=np.zeros((1, num_draws)),
-            noise_scale=noise[i][None],
-            impulse_scale=None,
+            noise_scale=each[i].noise.reading[None],
+            impulse_scale=each[i].noise.impulse[None],
             log_evidence=np.full(1, np.nan),
             evidence=None,
             diagnostics=[verdict],
             chain_index=np.arange(num_chains),
         )
-        results[body.scene].append(BlockResult(body.block, block_draws, 0))
+        result = BlockResult(body.block, block_draws, 0, each[i].residual)
+        results[body.scene].append(result)
     posteriors = []
     for scene, spec in enumerate(specs):
         posterior = assemble_posterior(
@@ -339,7 +351,7 @@ def _posteriors(
             spec,
             results[scene],
             seconds={},
-            notes=[*_notes(objects, scene), *untouched_notes(spec)],
+            notes=[*_notes(objects, spec, scene), *untouched_notes(spec)],
             method="kinds",
         )
         posteriors.append(
@@ -352,36 +364,21 @@ def _posteriors(
     return posteriors
 
 
-def _notes(objects: ObjectsAlone, scene: int) -> list[str]:
+def _notes(objects: ObjectsAlone, spec: SceneSpec, scene: int) -> list[str]:
     notes = ["bodies are taken not to be tied to each other"]
-    at_rest = [b.name for b in objects.bodies if b.scene == scene and b.bumps is None]
+    mine = [body for body in objects.bodies if body.scene == scene]
+    at_rest = [body.name for body in mine if body.bumps is None]
     if at_rest:
         notes.append(
             f"known by their kinds alone, never in motion: {', '.join(at_rest)}"
         )
-    return notes
-
-
-def _noise(key: Key, objects: ObjectsAlone, structure, z) -> list[np.ndarray]:
-    """Noise scales given every draw, `[draw, 1, 4]` of each body."""
-    rng = host_generator(key)
-    out: list[np.ndarray] = []
-    for body in objects.bodies:
-        scale = np.asarray(_coordinates(body).scales.noise, float)
-        gamma = rng.gamma(NOISE_SHAPE, size=(len(structure), 1, 4))
-        out.append(scale / np.sqrt(gamma))
-    for batch, targets in enumerate(objects.targets):
-        members = [i for i, body in enumerate(objects.bodies) if body.batch == batch]
-        members.sort(key=lambda i: objects.bodies[i].place)
-        found = draw_noise_scales(
-            jax.random.fold_in(key, batch),
-            targets,
-            structure[:, members].T,
-            np.swapaxes(z[:, members], 0, 1),
+    given = [b.name for b in mine if spec.bodies[b.body].density is not None]
+    if given:
+        notes.append(
+            "densities that the scene gives tell nothing of others of a kind: "
+            f"{', '.join(given)}"
         )
-        for place, i in enumerate(members):
-            out[i] = found[place]
-    return out
+    return notes
 
 
 def _coordinates(body: BodyAlone) -> Coordinates:

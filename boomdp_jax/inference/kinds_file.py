@@ -12,8 +12,9 @@ from boomdp_jax.core.json_header import read_json_header
 from boomdp_jax.core.npz_file import read_npz, write_npz
 from boomdp_jax.inference.kind_prior import KindPrior, check_kind_prior
 from boomdp_jax.inference.kind_state import Tallies
+from boomdp_jax.inference.prior import DEFAULT_SCALES
 
-SCHEMA = "boomdp-kinds-1"
+SCHEMA = "boomdp-kinds-2"
 _MAX_HEADER_BYTES = 2**20
 _SHAPES = {
     "count": (),
@@ -30,6 +31,7 @@ _HEADER_FIELDS = {
     "labels": list,
     "num_features": int,
     "reach": (int, float),
+    "scales": dict,
     "prior": dict,
     "versions": dict,
 }
@@ -57,6 +59,8 @@ class LearntKinds:
     """Features of outlines, the last coordinates; 0: outlines did not count."""
     reach: float
     """How far anchors may lie beyond an outline, in radii."""
+    scales: dict[str, tuple[float, float]]
+    """Prior of each number of a body, in units of which kinds have theirs."""
     prior: KindPrior
     versions: dict[str, str]
 
@@ -77,6 +81,7 @@ class LearntKinds:
             "labels": list(self.labels),
             "num_features": self.num_features,
             "reach": self.reach,
+            "scales": self.scales,
             "prior": self.prior._asdict(),
             "versions": dict(self.versions),
         }
@@ -131,9 +136,22 @@ def load_kinds(path: str | os.PathLike) -> LearntKinds:
         labels=tuple(header["labels"]),
         num_features=header["num_features"],
         reach=float(header["reach"]),
+        scales=_read_scales(path, header["scales"]),
         prior=prior,
         versions=header["versions"],
     )
+
+
+def _read_scales(path: str | os.PathLike, scales: dict) -> dict:
+    """Centre and spread of each number that a prior has."""
+    for name in DEFAULT_SCALES:
+        pair = scales.get(name)
+        is_pair = isinstance(pair, list) and len(pair) == 2
+        if not is_pair or not all(isinstance(value, int | float) for value in pair):
+            raise ValueError(
+                f"{path}: scales: {name}: expected a centre and a spread, got {pair!r}"
+            )
+    return {name: tuple(map(float, scales[name])) for name in DEFAULT_SCALES}
 
 
 def _check_arrays(

@@ -79,6 +79,13 @@ class ObjectMove:
         self._log_weight = np.full((*kinds.log_weight.shape, bumps.num), -np.inf)
         self._log_weight[pairs] = mass + kinds.log_weight[pairs][:, None]
 
+    @property
+    def log_total(self) -> np.ndarray:
+        """Log of what all kinds and bumps weigh together, `[chain]`."""
+        flat = self._log_weight.reshape(len(self._log_weight), -1)
+        highest = flat.max(axis=1)
+        return highest + np.log(np.exp(flat - highest[:, None]).sum(axis=1))
+
     def draw(self, rng: np.random.Generator) -> Choice:
         """Propose kind, structure and coordinates afresh."""
         num_chains = len(self._log_weight)

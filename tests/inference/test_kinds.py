@@ -15,6 +15,7 @@ from boomdp_jax.inference.kind_problem import settle
 from boomdp_jax.inference.kind_state import Tallies
 from boomdp_jax.inference.kinds import _check_options
 from boomdp_jax.inference.kinds_file import LearntKinds
+from boomdp_jax.inference.prior import DEFAULT_SCALES
 from boomdp_jax.inference.structure_draws import SampleSettings
 from boomdp_jax.physics.body_spec import read_body
 from boomdp_jax.physics.scene_spec import scene_spec_from_dict
@@ -53,6 +54,14 @@ def test_bodies_with_other_constraints_are_refused_by_name():
     spec = scene([box("a"), box("b")], constraints=[wheel])
     with pytest.raises(ValueError, match="body 'b': expected the constraints"):
         infer_kinds(jax.random.key(0), spec, nothing_seen(2))
+
+
+def test_scenes_with_other_priors_are_refused_by_number():
+    """Objects of a kind share numbers in units of their prior."""
+    wide = {"density": {"center": 100.0, "spread": 1.0}}
+    specs = [scene([box("a")]), scene([box("a")], prior=wide)]
+    with pytest.raises(ValueError, match=r"prior: density: expected the scale of all"):
+        infer_kinds(jax.random.key(0), specs, [nothing_seen(1)] * 2)
 
 
 @pytest.mark.parametrize(
@@ -171,6 +180,7 @@ def learnt() -> LearntKinds:
         labels=("chair", "table"),
         num_features=4,
         reach=0.5,
+        scales={name: (0.1, 1.5) for name in DEFAULT_SCALES},
         prior=KindPrior(structure_weight=0.3),
         versions={"jax": "0"},
     )
@@ -202,6 +212,7 @@ def test_damaged_files_of_kinds_are_refused(tmp_path):
             "tallies": kinds.tallies._replace(first=kinds.tallies.first * np.nan)
         },
         "prior: spreads: expected numbers": {"prior": KindPrior(spreads=(2.0,))},
+        "scales: density: expected a centre and a spread, got None": {"scales": {}},
     }
     for message, change in cases.items():
         dataclasses.replace(kinds, **change).save(path)
