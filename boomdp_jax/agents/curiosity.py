@@ -90,7 +90,7 @@ def _best(
         return None
     told = informative_wrench(
         key,
-        online.posterior(belief),
+        online.posterior(belief, check=False),
         state,
         wrenches,
         num_steps=num_steps,

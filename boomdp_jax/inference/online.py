@@ -31,6 +31,8 @@ from boomdp_jax.inference.arguments import check_history
 from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.compile_ahead import signature
 from boomdp_jax.inference.components import independent_blocks
+from boomdp_jax.inference.doubts import with_doubts
+from boomdp_jax.inference.online_check import check_online
 from boomdp_jax.inference.online_fit import make_online_block, refit_settings
 from boomdp_jax.inference.online_posterior import (
     best_params,
@@ -333,10 +335,24 @@ class OnlineBelief:
         name = signature(targets), self._step, sizes
         try_out(self, name, None if self._settings.is_uniform else self._dt, most)
 
-    def posterior(self, belief: BeliefState) -> Posterior:
-        """Weighted draws: particles of one block, those of several paired at random."""
+    def posterior(self, belief: BeliefState, *, check: bool = True) -> Posterior:
+        """Weighted draws: particles of one block, those of several paired at random.
+
+        Args:
+            belief: so far.
+            check: whether to look for laws that the model lacks, and for what else
+                gives `infer` to think, so that `diagnostics["ok"]` means the same. It
+                takes a refit's time.
+        """
         key = jax.random.fold_in(belief.key, 1)
-        return online_posterior(key, self.spec, self._parts(belief))
+        laws = None
+        if check:
+            known = self._settings, belief.history, int(belief.num_rows)
+            laws = functools.partial(check_online, *known)
+        posterior = online_posterior(key, self.spec, self._parts(belief), laws)
+        if not check:
+            return posterior
+        return with_doubts(posterior, self.spec, belief.history, [])
 
     def sample_params(self, key: Key, belief: BeliefState, num_samples: int) -> Params:
         """Draw hypotheses, for a planner between two steps; on the host.

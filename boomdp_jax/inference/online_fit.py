@@ -185,7 +185,7 @@ class Fitter:
         else:
             if not _is_alike(known, block, end - begin):
                 return None
-            block = block._replace(target=_in_coordinates_of(known, block.target))
+            block = block._replace(target=in_coordinates_of(known, block.target))
             targets = stack_blocks([block])
             found = warm_modes(rng, targets, _known_of(rng, known), settings.fit)
         is_near = known is not None
@@ -242,7 +242,7 @@ def _is_alike(belief: BlockBelief, block: Block, num_rows: int) -> bool:
     return is_near and num_rows <= _GROWN * int(belief.fit.num_rows)
 
 
-def _in_coordinates_of(belief: BlockBelief, target: StructureTarget) -> StructureTarget:
+def in_coordinates_of(belief: BlockBelief, target: StructureTarget) -> StructureTarget:
     """A target whose coordinates mean what they meant to a belief."""
     likelihood: Any = belief.target.log_likelihood
     return eqx.tree_at(

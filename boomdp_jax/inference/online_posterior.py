@@ -1,6 +1,7 @@
 """An online belief as a `Posterior`: particles decoded, with noise drawn for each."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -20,6 +21,7 @@ from boomdp_jax.inference.online_likelihood import levels_of, log_likelihoods
 from boomdp_jax.inference.online_state import BlockBelief
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.resampling import systematic
+from boomdp_jax.inference.residual import ResidualCheck
 from boomdp_jax.inference.sample import BlockDraws
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene_spec import SceneSpec
@@ -29,7 +31,10 @@ _LEAST_SHARE = 0.05
 
 
 def online_posterior(
-    key: Key, spec: SceneSpec, parts: list[tuple[Block, BlockBelief]]
+    key: Key,
+    spec: SceneSpec,
+    parts: list[tuple[Block, BlockBelief]],
+    check: Callable[[Block, BlockBelief, BlockDraws], ResidualCheck] | None = None,
 ) -> Posterior:
     """Put the particles of independent blocks side by side.
 
@@ -37,6 +42,7 @@ def online_posterior(
         key: random key.
         spec: the scene.
         parts: its blocks, and what is believed of each.
+        check: what looks for laws that the model lacks; None: nothing does.
 
     Returns:
         Draws; their weights are those of the particles where there is one block.
@@ -52,7 +58,11 @@ def online_posterior(
             log_weight = np.log(weight / weight.sum())
         else:
             rows = rng.permutation(systematic(rng, weight, len(weight)))
-        results.append(_result(rng, spec, block, belief, rows))
+        result = _result(rng, spec, block, belief, rows)
+        if check is not None:
+            residual = check(block, belief, result.draws)
+            result = result._replace(residual=residual)
+        results.append(result)
     posterior = assemble_posterior(
         assemble_key,
         spec,
@@ -170,6 +180,8 @@ def _result(
     reasons = []
     if size < _LEAST_SHARE * len(weight):
         reasons.append(f"{size:.0f} of {len(weight)} particles are left in effect")
+    if int(belief.fit.num_rows) == 0 and np.any(num > 0):
+        reasons.append("nothing has been fitted yet: particles are draws of the prior")
     verdict = ChainDiagnostics(
         ok=not reasons,
         reasons=reasons,

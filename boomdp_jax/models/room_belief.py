@@ -205,7 +205,7 @@ class LearntRoom(RoomBelief):
         if learnt.num_pushes == 0:
             weight = np.ones(learnt.draws.density.shape[0])
             return kind_shares(learnt.draws, model.scene, self._force, weight)
-        posterior = model.online.posterior(learnt.belief)
+        posterior = model.online.posterior(learnt.belief, check=False)
         return kind_shares(
             posterior.params, model.scene, self._force, posterior.weights
         )
