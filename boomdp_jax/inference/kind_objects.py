@@ -29,6 +29,7 @@ from boomdp_jax.inference.likelihood_bumps import Bumps
 from boomdp_jax.inference.likelihood_fit import fit_bumps
 from boomdp_jax.inference.noise_level import NoiseFit
 from boomdp_jax.inference.population import sample_population
+from boomdp_jax.inference.prior import LOGARITHMIC
 from boomdp_jax.inference.structure_draws import SampleSettings, start_mixtures
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.physics.scene_spec import SceneSpec
@@ -36,6 +37,10 @@ from boomdp_jax.physics.scene_spec import SceneSpec
 # Readings that differ from rest by more than so many of the prior's noise scales are
 # motion.
 _FAR = 8.0
+
+SCALE_TOLERANCE = 1e-5
+"""Relative difference of two scales that are the same: kinds that were learnt in single
+precision serve in double."""
 
 
 class BodyAlone(NamedTuple):
@@ -290,7 +295,7 @@ def _refuse_other_scales(specs: Sequence[SceneSpec], entries: list) -> None:
     first = prior_scales_of(entries[0][2])
     for scene, _, block, _ in entries:
         for name, scale in prior_scales_of(block).items():
-            if scale != first[name]:
+            if not np.allclose(scale, first[name], rtol=SCALE_TOLERANCE):
                 raise ValueError(
                     f"{specs[scene].source}: prior: {name}: expected the scale of all "
                     f"scenes, {first[name]}; got {scale}: objects of a kind share "
@@ -299,13 +304,14 @@ def _refuse_other_scales(specs: Sequence[SceneSpec], entries: list) -> None:
 
 
 def prior_scales_of(block: Block) -> dict[str, tuple[float, float]]:
-    """Centre and spread of every number, logarithms of those that are positive."""
+    """Centre and spread of every number, as a scene's prior has them."""
     likelihood: Any = block.target.log_likelihood
     scales = likelihood.coordinates.scales
-    return {
-        name: (float(scales.center[name]), float(scales.spread[name]))
-        for name in scales.center
-    }
+    found = {}
+    for name, center in scales.center.items():
+        middle = float(np.exp(center) if name in LOGARITHMIC else center)
+        found[name] = (middle, float(scales.spread[name]))
+    return found
 
 
 def _around(block: Block) -> Any:

@@ -29,6 +29,7 @@ from boomdp_jax.inference.kind_chains import (
 from boomdp_jax.inference.kind_features import number_labels, outline_features
 from boomdp_jax.inference.kind_noise import own_of_bodies
 from boomdp_jax.inference.kind_objects import (
+    SCALE_TOLERANCE,
     BodyAlone,
     ObjectsAlone,
     prior_scales_of,
@@ -256,10 +257,11 @@ def _before(
             f"({data.dim} coordinates), got {', '.join(prior_kinds.slots) or 'none'}"
         )
     for name, scale in prior_scales_of(objects.bodies[0].block).items():
-        if scale != prior_kinds.scales[name]:
+        known = prior_kinds.scales[name]
+        if not np.allclose(scale, known, rtol=SCALE_TOLERANCE):
             raise ValueError(
                 f"prior_kinds: expected kinds learnt with the prior of {name} of the "
-                f"scenes, {scale}; got one with {prior_kinds.scales[name]}"
+                f"scenes, {scale}; got {known}"
             )
     chosen = np.arange(num_chains) % prior_kinds.num_draws
     columns = data.dim + num_features
