@@ -90,7 +90,7 @@ def numbers_of(
         name, count = number.name, BODY_NUMBERS[number.name]
         origin, unit = number_scale(number, around, gyration)
         part = z[number.start : number.start + count]
-        value = origin + unit * (scales.center[name] + scales.spread[name] * part)
+        value = origin + unit * scales.scaled(name, part)
         if name in LOGARITHMIC:
             value = jnp.exp(value)
         if name not in arrays:

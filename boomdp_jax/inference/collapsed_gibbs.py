@@ -136,7 +136,9 @@ def _move(rng, data: KindData, state: KindState, i, new_slot, is_nudge) -> float
         of_kind = (x[chains, kind] for x in sums)
         return part.log_predictive(z, *of_kind, spread[chains, kind])
 
-    kinds = Kinds(log_weight, log_structure(data, tallies), mean, variance, log_exact)
+    kinds = Kinds(
+        log_weight, log_structure(data, tallies.structure), mean, variance, log_exact
+    )
     move = ObjectMove(bumps, data.in_use, part.period, kinds)
     own = np.where(
         tallies.count[chains, state.kind[:, i]] > 0, state.kind[:, i], new_slot
@@ -186,7 +188,9 @@ def fill_in(
     chains = np.arange(len(structure))
     for i in np.flatnonzero(~data.is_seen):
         kind = state.kind[:, i]
-        structure[:, i] = draw_index(rng, log_structure(data, tallies)[chains, kind])
+        structure[:, i] = draw_index(
+            rng, log_structure(data, tallies.structure)[chains, kind]
+        )
         sums = [
             x[chains, kind, :dim] for x in (tallies.num, tallies.first, tallies.second)
         ]

@@ -293,7 +293,7 @@ class Coordinates(eqx.Module):
         return Surface(**out)
 
     def _scaled(self, name: str, z):
-        return self.scales.center[name] + self.scales.spread[name] * z
+        return self.scales.scaled(name, z)
 
     def _numbers(self, slot: SlotKey, z, bodies: list[_Body], active) -> dict:
         """Numbers of one slot, zero where it is not active."""

@@ -52,7 +52,6 @@ def measure_from_bodies(target: StructureTarget, layout: Layout) -> StructureTar
     rest = np.array(_rest_of(target))
     for _, place in drawer_places(layout):
         rest[..., place, 3] = rest[..., place, 2]
-
     return eqx.tree_at(_rest_of, target, on_device(rest, rest.dtype))
 
 

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from boomdp_jax.inference.evaluate import evaluate_points
+from boomdp_jax.inference.evaluate import log_prior_density
 from boomdp_jax.inference.kind_objects import ObjectsAlone
 from boomdp_jax.inference.noise_correction import noise_about_peaks
 from boomdp_jax.inference.noise_level import NoiseFit, prior_noise
@@ -26,6 +26,7 @@ def own_of_bodies(
     objects: ObjectsAlone,
     structure: np.ndarray,
     z: np.ndarray,
+    log_likelihood: np.ndarray,
 ) -> list[OwnOfBody]:
     """Noise of readings and of the motion for every draw, and a check of residuals.
 
@@ -36,6 +37,7 @@ def own_of_bodies(
         objects: bodies sampled alone.
         structure: of each draw, `[draw, body]`.
         z: coordinates, `[draw, body, dim]`.
+        log_likelihood: of each, `[draw, body]`.
 
     Returns:
         One entry for each body.
@@ -52,7 +54,8 @@ def own_of_bodies(
         which, place = structure[:, members].T, np.swapaxes(z[:, members], 0, 1)
         index = np.repeat(np.arange(len(members)), num_draws)
         points = (index, which.reshape(-1), place.reshape(len(index), -1))
-        height = evaluate_points(targets, *points).log_density.reshape(which.shape)
+        height = log_prior_density(targets, *points).reshape(which.shape)
+        height = height + log_likelihood[:, members].T
         found = noise_about_peaks(
             rng, targets, objects.noise[batch], which, place, height, is_drawn=True
         )

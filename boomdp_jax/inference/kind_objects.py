@@ -310,7 +310,9 @@ def prior_scales_of(block: Block) -> dict[str, tuple[float, float]]:
     found = {}
     for name, center in scales.center.items():
         middle = float(np.exp(center) if name in LOGARITHMIC else center)
-        found[name] = (middle, float(scales.spread[name]))
+        # Six digits: what single precision makes of a number is not to be read.
+        spread = float(f"{scales.spread[name]:.6g}")
+        found[name] = (float(f"{middle:.6g}"), spread)
     return found
 
 

@@ -126,32 +126,29 @@ def settle(
     radius, reach = around.radius[0], around.radius[0] + around.spread[0]
     stood = on_device([*pose[:2], np.cos(pose[2]), np.sin(pose[2])])
 
-    def scaled(name: str, value):
-        return scales.center[name] + scales.spread[name] * value
-
-    def standard(name: str, value):
-        return (value - scales.center[name]) / scales.spread[name]
-
     def settled(row):
         for slot, frame in zip(layout.meetings, around.meeting, strict=True):
             if slot.body_b != WORLD:
                 continue
             own, start = row[slot.start :], slot.start
-            first = reach * scaled(f"{slot.kind}.anchor", own[0:2])
+            first = reach * scales.scaled(f"{slot.kind}.anchor", own[0:2])
             if slot.kind == "revolute":
                 off = (met_at(stood, first) - met_at(frame, first)) / radius
-                place = jnp.arcsinh(standard("revolute.offset", off))
+                place = jnp.arcsinh(scales.standard("revolute.offset", off))
                 row = row.at[start + 2 : start + 4].set(place)
             else:
-                second = reach * scaled("distance.anchor", own[2:4]) + around.center[0]
+                second = (
+                    reach * scales.scaled("distance.anchor", own[2:4])
+                    + around.center[0]
+                )
                 now = rod_length(stood, first, second, radius)
                 ratio = jnp.log(now / rod_length(frame, first, second, radius))
-                row = row.at[start + 4].set(standard("distance.length", ratio))
+                row = row.at[start + 4].set(scales.standard("distance.length", ratio))
         for slot in layout.rests:
             for place in PLACE_COORDINATES[slot.kind]:
                 is_angle = place == 2
                 name = f"{slot.kind}.{'angle' if is_angle else 'offset'}"
-                value = jnp.arcsinh(standard(name, 0.0))
+                value = jnp.arcsinh(scales.standard(name, jnp.zeros(())))
                 row = row.at[slot.start + place].set(value)
         return row
 

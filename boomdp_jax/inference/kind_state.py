@@ -176,11 +176,11 @@ def label_base(data: KindData) -> np.ndarray:
     return np.append(np.full(num, each), weight - num * each)
 
 
-def log_structure(data: KindData, tallies: Tallies) -> np.ndarray:
-    """Log-probability of each structure in each kind, `[chain, kind, K]`."""
+def log_structure(data: KindData, count: np.ndarray) -> np.ndarray:
+    """Log-probability of each structure in kinds that have so many, `[..., K]`."""
     weight = data.prior.structure_weight
-    share = tallies.structure + weight * np.exp(data.log_prior)
-    total = tallies.structure.sum(-1, keepdims=True) + weight
+    share = count + weight * np.exp(data.log_prior)
+    total = count.sum(-1, keepdims=True) + weight
     with np.errstate(divide="ignore"):
         return np.log(share / total)
 

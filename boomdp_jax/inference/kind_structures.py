@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from boomdp_jax.inference.kind_state import KindData, KindState
+from boomdp_jax.inference.kind_state import KindData, KindState, log_structure
 from boomdp_jax.inference.object_moves import Choice, Kinds, ObjectMove
 
 
@@ -34,20 +34,17 @@ class _Sums(NamedTuple):
 
 def restructure_kinds(
     rng: np.random.Generator, data: KindData, state: KindState
-) -> float:
+) -> None:
     """Propose new structures and coordinates for one kind of every chain.
 
     Args:
         rng: source of randomness.
         data: what is known of the objects.
         state: of all chains, changed in place; spreads are those it has.
-
-    Returns:
-        The share of chains that accepted.
     """
     seen = np.flatnonzero(data.is_seen)
     if not len(seen):
-        return 1.0
+        return
     num_chains = len(state.kind)
     chains = np.arange(num_chains)
     kind = state.kind[chains, rng.choice(seen, size=num_chains)]
@@ -55,39 +52,31 @@ def restructure_kinds(
     is_member = {i: state.kind[:, i] == kind for i in order}
     old = {i: (state.structure[:, i].copy(), state.z[:, i].copy()) for i in order}
     left = _without(data, state, kind, is_member, old)
-    way = _Way(data, state.spread[chains, kind, : data.dim])
+    spread = state.spread[chains, kind, : data.dim]
 
     new: dict[int, Choice] = {}
     log_odds, is_inside = np.zeros(num_chains), np.ones(num_chains, bool)
     sums = left.copy()
     for i in order:
-        move, log_total = way.move(i, sums)
+        move, mine = _move(data, i, spread, sums), is_member[i]
         new[i] = choice = move.draw(rng)
-        mine = is_member[i]
-        log_odds += np.where(mine, choice.log_ratio + log_total, 0.0)
+        log_odds += np.where(mine, choice.log_ratio + move.log_total, 0.0)
         is_inside &= choice.is_inside | ~mine
-        way.add(sums, choice.structure, choice.z, mine, 1.0)
-    back = left.copy()
+        _add(data, sums, choice.structure, choice.z, mine, 1.0)
     for i in order:
-        move, log_total = way.move(i, back)
+        move = _move(data, i, spread, left)
         ratio = move.log_ratio(np.zeros(num_chains, int), *old[i])
-        log_odds -= np.where(is_member[i], ratio + log_total, 0.0)
-        way.add(back, *old[i], is_member[i], 1.0)
+        log_odds -= np.where(is_member[i], ratio + move.log_total, 0.0)
+        _add(data, left, *old[i], is_member[i], 1.0)
 
-    index = np.concatenate([np.full(int(is_member[i].sum()), i) for i in order])
-    points = [
-        (choice.structure[is_member[i]], choice.z[is_member[i]])
-        for i, choice in new.items()
-    ]
-    structure, z = (np.concatenate(part) for part in zip(*points, strict=True))
-    found = np.split(
-        data.log_likelihood(index, structure, z),
-        np.cumsum([int(is_member[i].sum()) for i in order])[:-1],
-    )
+    found = {i: (new[i].structure[m], new[i].z[m]) for i, m in is_member.items()}
+    structure, z = map(np.concatenate, zip(*found.values(), strict=True))
+    num_each = [len(part) for part, _ in found.values()]
+    values = data.log_likelihood(np.repeat(order, num_each), structure, z)
     likelihood = {}
-    for i, values in zip(order, found, strict=True):
+    for i, part in zip(order, np.split(values, np.cumsum(num_each)[:-1]), strict=True):
         likelihood[i] = state.log_likelihood[:, i].copy()
-        likelihood[i][is_member[i]] = values
+        likelihood[i][is_member[i]] = part
         log_odds += likelihood[i] - state.log_likelihood[:, i]
     level = np.log(1.0 - rng.random(num_chains))
     is_taken = is_inside & (level < np.nan_to_num(log_odds, nan=-np.inf))
@@ -97,7 +86,6 @@ def restructure_kinds(
         state.z[taken, i] = new[i].z[taken]
         state.log_likelihood[taken, i] = likelihood[i][taken]
     _store(data, state, kind, is_taken, sums)
-    return float(is_taken.mean())
 
 
 def _without(data, state: KindState, kind, is_member, old) -> _Sums:
@@ -131,40 +119,21 @@ def _add(data, sums: _Sums, structure, z, mine, sign: float) -> None:
     sums.second[...] += sign * np.where(has, second, 0.0)
 
 
-class _Way:
-    """Objects coming back to one kind of each chain."""
+def _move(data: KindData, i: int, spread: np.ndarray, sums: _Sums) -> ObjectMove:
+    """Proposal of object i by what the sums have; to be used before they change."""
+    part, tallied = data.coordinates.part(0, data.dim), sums[1:]
+    mean, variance = part.predictive(*tallied, spread)
 
-    def __init__(self, data: KindData, spread: np.ndarray):
-        self._data, self._spread = data, spread
-        self._part = data.coordinates.part(0, data.dim)
+    def log_exact(_: np.ndarray, z: np.ndarray) -> np.ndarray:
+        return part.log_predictive(z, *tallied, spread)
 
-    def move(self, i: int, sums: _Sums) -> tuple[ObjectMove, np.ndarray]:
-        """Proposal of object i given the sums, and its log-normaliser, `[chain]`."""
-        data, part = self._data, self._part
-        # Copies: the object stays as it was made while the sums go on.
-        num, first, second = (array.copy() for array in sums[1:])
-        mean, variance = part.predictive(num, first, second, self._spread)
-        weight = data.prior.structure_weight
-        share = sums.structure + weight * np.exp(data.log_prior)
-        total = share.sum(axis=-1, keepdims=True)
-        with np.errstate(divide="ignore"):
-            log_structure = np.log(share / total)
-
-        def log_exact(_: np.ndarray, z: np.ndarray) -> np.ndarray:
-            return part.log_predictive(z, num, first, second, self._spread)
-
-        bumps = data.bumps[i]
-        assert bumps is not None
-        kinds = Kinds(
-            np.zeros((len(mean), 1)),
-            log_structure[:, None],
-            mean[:, None],
-            variance[:, None],
-            log_exact,
-        )
-        move = ObjectMove(bumps, data.in_use, part.period, kinds)
-        return move, move.log_total
-
-    def add(self, sums: _Sums, structure, z, mine, sign: float) -> None:
-        """Put an object into the sums."""
-        _add(self._data, sums, structure, z, mine, sign)
+    bumps = data.bumps[i]
+    assert bumps is not None
+    kinds = Kinds(
+        np.zeros((len(mean), 1)),
+        log_structure(data, sums.structure)[:, None],
+        mean[:, None],
+        variance[:, None],
+        log_exact,
+    )
+    return ObjectMove(bumps, data.in_use, part.period, kinds)

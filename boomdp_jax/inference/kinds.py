@@ -305,7 +305,8 @@ def _posteriors(
     z = draws.z[:, kept].reshape(num_draws, structure.shape[1], -1).astype(dtype)
     log_joint = draws.log_joint[:, kept]
     rng = host_generator(jax.random.fold_in(key, 1))
-    each = own_of_bodies(rng, objects, structure, z)
+    likelihood = draws.log_likelihood[:, kept].reshape(num_draws, -1)
+    each = own_of_bodies(rng, objects, structure, z, likelihood)
     ordered = np.sort(draws.kind[:, kept], axis=2)
     num_kinds = 1.0 + np.sum(ordered[..., 1:] != ordered[..., :-1], axis=2)
     concentration = np.maximum(draws.concentration[:, kept], 1e-300)

@@ -27,6 +27,7 @@ from jaxtyping import Array, Float
 from boomdp_jax.core.arrays import FloatScalar
 from boomdp_jax.inference.layout import SlotKey
 from boomdp_jax.inference.prior import PriorScales
+from boomdp_jax.inference.resting import known_or, poses_against
 from boomdp_jax.physics.params import WORLD
 
 _SHORTEST = 1e-3
@@ -47,26 +48,13 @@ def meeting_frame(
         x, y [m], and c, s of the map $(x, y) + ((c, -s), (s, c)) r$: a rotation for a
         rod, for a pin a mean of some.
     """
-    columns = [slot.body_a] + ([] if slot.body_b == WORLD else [slot.body_b])
-    seen = poses[:, columns]
-    seen = seen[np.all(np.isfinite(seen), axis=(1, 2))]
-    if len(seen) == 0:
-        seen = default[None, columns]
+    place, angle = poses_against(slot, poses, default)
     if slot.kind == "distance":
-        seen = seen[:1]
-    x, y, angle = seen[:, 0].T
-    if slot.body_b != WORLD:
-        east, north, turn = seen[:, 1].T
-        cos, sin = np.cos(turn), np.sin(turn)
-        east, north = x - east, y - north
-        x, y = cos * east + sin * north, cos * north - sin * east
-        angle = angle - turn
-    return (
-        float(x.mean()),
-        float(y.mean()),
-        float(np.cos(angle).mean()),
-        float(np.sin(angle).mean()),
-    )
+        # A mean over one reading is a rotation.
+        place, angle = place[:1], angle[:1]
+    x, y = place.mean(axis=0)
+    cos, sin = np.cos(angle).mean(), np.sin(angle).mean()
+    return float(x), float(y), float(cos), float(sin)
 
 
 def met_at(frame: Float[Array, " 4"], anchor: Float[Array, " 2"]) -> Float[Array, " 2"]:
@@ -142,13 +130,10 @@ def meeting_numbers(
     """
 
     def scaled(name: str, at):
-        return scales.center[f"{slot.kind}.{name}"] + (
-            scales.spread[f"{slot.kind}.{name}"] * at
-        )
+        return scales.scaled(f"{slot.kind}.{name}", at)
 
     def given(name: str, value):
-        number = known.get(name, jnp.full_like(value, jnp.nan))
-        return jnp.where(jnp.isnan(number), value, number)
+        return known_or(known, name, value)
 
     if slot.kind == "revolute":
         middle, unit = anchor_scale(slot, frame, reach)

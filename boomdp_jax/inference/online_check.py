@@ -14,7 +14,7 @@ from boomdp_jax.inference.sample import BlockDraws
 _LEAST_WEIGHT = math.exp(-1.0)
 
 
-def first_row_checked(belief: BlockBelief, num_rows: int, forgetting: float) -> int:
+def _first_row(belief: BlockBelief, num_rows: int, forgetting: float) -> int:
     """First row of a belief's table that its residuals are asked about."""
     begin = int(belief.begin)
     if forgetting < 1.0:
@@ -44,7 +44,7 @@ def check_online(
     Returns:
         What was found; nothing where rows are few.
     """
-    begin = first_row_checked(belief, num_rows, settings.forgetting)
+    begin = _first_row(belief, num_rows, settings.forgetting)
     if num_rows <= begin:
         return ResidualCheck(0, [], [])
     window = windowed(history, begin, num_rows, None)

@@ -131,6 +131,18 @@ class PriorScales(eqx.Module):
     noise: Float[Array, " 4"]
     """Scale of each noise group."""
 
+    def scaled(
+        self, name: str, z: Float[Array, "*coordinate"]
+    ) -> Float[Array, "*coordinate"]:
+        """A number, on the scale that is sampled, from standard-normal coordinates."""
+        return self.center[name] + self.spread[name] * z
+
+    def standard(
+        self, name: str, value: Float[Array, "*coordinate"]
+    ) -> Float[Array, "*coordinate"]:
+        """The coordinates of a number: `scaled` backwards."""
+        return (value - self.center[name]) / self.spread[name]
+
 
 class PriorOptions(NamedTuple):
     """A scene's prior: scales, structure probabilities."""

@@ -26,6 +26,34 @@ from boomdp_jax.inference.prior import PriorScales
 from boomdp_jax.physics.params import WORLD
 
 
+def poses_against(
+    slot: SlotKey, poses: np.ndarray, default: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where a slot's body was in the frame of its partner, or of the world.
+
+    Args:
+        slot: of any joint.
+        poses: readings `[reading, body, 3]` [m, m, rad]; NaN where missing.
+        default: pose of each body without any reading, `[body, 3]`.
+
+    Returns:
+        Places `[seen, 2]` [m] and angles `[seen]` [rad] at the readings that are whole,
+        one at least.
+    """
+    columns = [slot.body_a] + ([] if slot.body_b == WORLD else [slot.body_b])
+    seen = poses[:, columns]
+    seen = seen[np.all(np.isfinite(seen), axis=(1, 2))]
+    if len(seen) == 0:
+        seen = default[None, columns]
+    place, angle = seen[:, 0, :2], seen[:, 0, 2]
+    if slot.body_b != WORLD:
+        x, y = (place - seen[:, 1, :2]).T
+        cos, sin = np.cos(seen[:, 1, 2]), np.sin(seen[:, 1, 2])
+        place = np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
+        angle = angle - seen[:, 1, 2]
+    return place, angle
+
+
 def rest_pose(
     slot: SlotKey, poses: np.ndarray, default: np.ndarray
 ) -> tuple[float, float, float, float]:
@@ -43,17 +71,7 @@ def rest_pose(
         x, y [m] and angle [rad] of body `a` in the frame of `b` or of the world, and
         the direction there in which positions spread most [rad].
     """
-    columns = [slot.body_a] + ([] if slot.body_b == WORLD else [slot.body_b])
-    seen = poses[:, columns]
-    seen = seen[np.all(np.isfinite(seen), axis=(1, 2))]
-    if len(seen) == 0:
-        seen = default[None, columns]
-    place, angle = seen[:, 0, :2], seen[:, 0, 2]
-    if slot.body_b != WORLD:
-        x, y = (place - seen[:, 1, :2]).T
-        cos, sin = np.cos(seen[:, 1, 2]), np.sin(seen[:, 1, 2])
-        place = np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
-        angle = angle - seen[:, 1, 2]
+    place, angle = poses_against(slot, poses, default)
     off = angle - angle[0]
     middle = place.mean(0)
     (xx, xy), (_, yy) = (place - middle).T @ (place - middle)
@@ -63,6 +81,14 @@ def rest_pose(
         float(angle[0] + np.mean(off - 2.0 * np.pi * np.round(off / (2.0 * np.pi)))),
         float(0.5 * np.arctan2(2.0 * xy, xx - yy)),
     )
+
+
+def known_or(
+    known: dict[str, Float[Array, "..."]], name: str, value: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """What a scene gives of a number, and the rest of it from `value`."""
+    number = known.get(name, jnp.full_like(value, jnp.nan))
+    return jnp.where(jnp.isnan(number), value, number)
 
 
 def rest_numbers(
@@ -88,11 +114,10 @@ def rest_numbers(
     """
 
     def scaled(name: str, at):
-        return scales.center[f"{kind}.{name}"] + scales.spread[f"{kind}.{name}"] * at
+        return scales.scaled(f"{kind}.{name}", at)
 
     def given(name: str, value):
-        number = known.get(name, jnp.full_like(value, jnp.nan))
-        return jnp.where(jnp.isnan(number), value, number)
+        return known_or(known, name, value)
 
     numbers = {"angle": given("angle", rest[2] + scaled("angle", jnp.sinh(z[2])))}
     if kind == "prismatic":

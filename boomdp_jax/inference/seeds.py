@@ -9,7 +9,6 @@ from boomdp_jax.inference.coordinates import Coordinates
 from boomdp_jax.inference.layout import BODY_NUMBERS, SlotKey
 from boomdp_jax.inference.meeting import anchor_scale, met_at
 from boomdp_jax.inference.one_step import Readings
-from boomdp_jax.inference.prior import PriorScales
 from boomdp_jax.physics.params import WORLD
 
 # Distances [m] and speeds [m/s] that weigh the same in a guess: what a camera resolves.
@@ -131,10 +130,6 @@ def seed_coordinates(
     return jnp.clip(z, -6.0, 6.0), has
 
 
-def _standard(scales: PriorScales, name: str, value):
-    return (value - scales.center[name]) / scales.spread[name]
-
-
 def _pin_seed(coordinates: Coordinates, data: Readings, slot: SlotKey, reach):
     around, scales = coordinates.surroundings, coordinates.scales
     padded = jnp.concatenate([reach, reach[slot.body_a][None]])  # WORLD is the last.
@@ -144,8 +139,8 @@ def _pin_seed(coordinates: Coordinates, data: Readings, slot: SlotKey, reach):
     off = (second - met_at(frame, first)) / around.radius[slot.body_a]
     return jnp.concatenate(
         [
-            _standard(scales, "revolute.anchor", (first - middle) / unit),
-            jnp.arcsinh(_standard(scales, "revolute.offset", off)),
+            scales.standard("revolute.anchor", (first - middle) / unit),
+            jnp.arcsinh(scales.standard("revolute.offset", off)),
         ]
     )
 
@@ -157,8 +152,7 @@ def _wheel_seed(coordinates: Coordinates, data: Readings, slot: SlotKey):
     direction = jnp.stack([jnp.cos(heading), jnp.sin(heading)])
     middle = around.box_center[body]
     position = middle + direction * (along - direction @ middle)
-    z = _standard(
-        coordinates.scales,
+    z = coordinates.scales.standard(
         "wheel.position",
         (position - middle) / around.half_extents[body],
     )
