@@ -149,6 +149,7 @@ def box():
     return stack_blocks([make_block(spec, (0,), free_box(rng, 60)) for _ in range(2)])
 
 
+@pytest.mark.slow
 def test_a_heading_that_changes_nothing_is_as_wide_as_half_a_turn(wheeled):
     structures = np.asarray(wheeled.structures[0])
     wheel = np.flatnonzero(structures.any(axis=1))[:1]

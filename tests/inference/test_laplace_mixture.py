@@ -57,6 +57,7 @@ def student(mixture, component, coordinates):
     return stats.multivariate_t(mean, shape, df=FREEDOM)
 
 
+@pytest.mark.slow
 def test_components_of_other_structures_change_nothing():
     """Nor does it matter in which order they come, and how much room there is."""
     target = make_target(two_sided)

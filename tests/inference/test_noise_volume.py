@@ -33,7 +33,13 @@ def recorded():
     return make_history(state, rows.action[:, None], next_state, DT, episode=episode)
 
 
-@pytest.fixture(scope="module", params=[1.0, 0.97], ids=["all alike", "forgetting"])
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(1.0, id="all alike"),
+        pytest.param(0.97, id="forgetting", marks=pytest.mark.slow),
+    ],
+)
 def problem(request):
     """Targets, a hypothesis near the best fit, its track, and noises about that's."""
     settings = refit_settings(

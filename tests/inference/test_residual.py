@@ -232,6 +232,7 @@ def test_commands_that_come_late_are_a_delay():
     assert_names(found, "delay", [share * DT])
 
 
+@pytest.mark.slow
 def test_reports_say_the_law_in_words_and_numbers():
     history = worlds.record_box(np.random.default_rng(7), 100, worlds.viscous(3.0))
     (found,) = check([history])

@@ -79,6 +79,7 @@ def test_exact_starts_need_a_reading_of_some_body():
             )
 
 
+@pytest.mark.slow
 def test_the_posterior_says_of_whom_nothing_was_read():
     """The other body's density is found all the same."""
     spec, history = boxes(np.random.default_rng(3))

@@ -68,6 +68,7 @@ def test_a_few_pushes_tell_what_a_cart_is(task):
     assert np.std(density) > 0
 
 
+@pytest.mark.slow
 def test_fewer_than_one_sample_is_refused(task):
     online = OnlineBelief(task.spec, capacity=16, num_particles=16)
     belief = online.init(jax.random.key(0))

@@ -104,6 +104,7 @@ def alone():
     return {name: run([island])[:, :-1] for name, island in ISLANDS.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in ISLANDS if name != OFF])
 def test_two_islands_are_what_each_is_alone(name, alone):
     together = run([ISLANDS[name], ISLANDS[OFF]])[:, :-1]
@@ -111,6 +112,7 @@ def test_two_islands_are_what_each_is_alone(name, alone):
     np.testing.assert_allclose(together, expected, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_bodies_that_meet_are_what_they_are_alone():
     expected = run([MEETING])[:, :-1]
     # They do meet.
@@ -180,6 +182,7 @@ def test_a_body_that_starts_slowly_starts(place, pull, dt):
     np.testing.assert_allclose(states[:, 0, 3], pull * time, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_smoothed_contact_far_away_joins_nothing():
     contact = {"contact": DISC["contact"]}
     table = ISLANDS[OFF]

@@ -210,6 +210,7 @@ def with_wheels(params, key, half_track):
     return changed(params, wheel=wheel)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind",
     [
@@ -235,6 +236,7 @@ def test_wheels_of_a_body_with_a_slot_for_a_drawer(paths, kind, half_track):
     assert np.max(worst) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_wheel_across_its_line_holds_a_drawer_up_to_its_limit():
     """Terminal speed and rest, from the law along the line by itself."""
     turned, force = 0.5, 3.0
@@ -271,6 +273,7 @@ def test_a_wheel_across_its_line_holds_a_drawer_up_to_its_limit():
         assert float(end[2]) == 0.0
 
 
+@pytest.mark.slow
 def test_a_pinned_body_turns_as_far_with_slots_for_everything_else(paths):
     """More than a radian a substep, where the general solver would lose energy."""
     params, state, _ = cases("revolute")

@@ -141,6 +141,7 @@ def test_what_is_taken_out_of_a_batch_is_solved_as_in_a_small_one(cases):
     np.testing.assert_allclose(parts, whole[:1024], rtol=1e-9, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_fixed_number_of_iterations_solves_most(cases, expected):
     # As on other backends than a CPU.
     without = ("physics.lone_step", "_search", lambda body, now, force: (None, body))

@@ -63,6 +63,7 @@ def worlds(single_precision):
     return specs[0].scene, params, pose, twist, wrench
 
 
+@pytest.mark.slow
 def test_steps_that_the_line_tells_nothing_of_are_taken_whole(worlds, monkeypatch):
     """Six iterations beyond the first ones will do, where there are no later ones.
 
