@@ -16,6 +16,11 @@ from boomdp_jax.core.checked_input import (
     whole_number,
 )
 
+SAME_READING = 1e-6
+"""Two readings of an instant are one where all channels agree within this, as a share
+or in m, rad, m/s or rad/s: one that was rounded to single precision on its way, or to
+six decimals in a text file. Taken for two they would tell of sensors without noise."""
+
 
 class Transition(eqx.Module):
     """One observed step (s, a, s') of every body.
@@ -35,7 +40,8 @@ class History(eqx.Module):
     """A table of transitions with a mask, so that a longer history never recompiles.
 
     Missing readings are masked channel by channel and hold zero. `is_chained[t]` says
-    that the reading `state[t]` is the very reading `next_state[t - 1]`.
+    that the reading `state[t]` is the very reading `next_state[t - 1]`, up to rounding
+    (`SAME_READING`).
     """
 
     state: Float[Array, "*batch time body 6"]
@@ -193,7 +199,8 @@ def make_history(
     is_chained = np.zeros(num_rows, bool)
     if num_rows > 1:
         now, before = state[1:], next_state[:-1]
-        same = np.all((now == before) | (np.isnan(now) & np.isnan(before)), axis=(1, 2))
+        close = np.abs(now - before) <= SAME_READING * np.maximum(1.0, np.abs(now))
+        same = np.all(close | (np.isnan(now) & np.isnan(before)), axis=(1, 2))
         is_chained[1:] = same & (episode[1:] == episode[:-1])
 
     def pad(array, fill=0):

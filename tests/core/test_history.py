@@ -49,9 +49,22 @@ def test_a_missing_reading_is_masked_and_zero():
 
 def test_readings_chain_within_an_episode_only():
     rows = _rows()
-    rows["state"][4] += 1e-12
+    rows["state"][4] += 1e-5
     history = make_history(**rows, episode=np.array([0, 0, 1, 1, 1]))
     np.testing.assert_array_equal(history.is_chained, [False, True, False, True, False])
+
+
+@pytest.mark.parametrize("places", [None, 6], ids=["single precision", "six decimals"])
+def test_a_reading_that_was_rounded_on_its_way_is_one_reading(places):
+    """Two would agree far better than any sensor, which then seems to have no noise."""
+    rows = _rows()
+    first, second = rows["state"], rows["next_state"]
+    rows["next_state"] = (
+        second.astype(np.float32) if places is None else np.round(second, places)
+    )
+    history = make_history(**rows)
+    assert not np.array_equal(rows["next_state"][:-1], first[1:])
+    np.testing.assert_array_equal(history.is_chained, [False, True, True, True, True])
 
 
 def test_an_empty_history_is_allowed():
