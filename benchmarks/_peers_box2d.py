@@ -9,7 +9,7 @@ torque have separate limits.
 """
 
 import numpy as np
-from _peers_program import NotExpressibleError, Peer, Program
+from _peers_program import NotExpressibleError, Peer, Program, mean_arm
 from Box2D import (
     b2_linearSlop,
     b2_polygonRadius,
@@ -87,7 +87,7 @@ def _add_joint(world, spec, constraint, base, bodies) -> None:
             localAnchorA=(0.0, 0.0),
             localAnchorB=(0.0, 0.0),
             maxForce=limit,
-            maxTorque=limit * float(body.foot_load @ np.hypot(*body.feet.T)),
+            maxTorque=limit * mean_arm(body),
         )
     else:
         raise NotExpressibleError(f"no {constraint.kind}")

@@ -86,16 +86,17 @@ def floor_plane() -> str:
     """The floor of a scene seen from above, with no friction but that of the feet."""
     return (
         f'<geom type="plane" size="0 0 1" pos="0 0 {-HEIGHT}" condim="3" '
-        'friction="0 0.005 0.0001"/>'
+        'friction="0 0 0.0001"/>'
     )
 
 
 def feet(body: BodySpec, friction: float) -> str:
     """Spheres that rest on the floor."""
     return "".join(
-        f'<geom type="sphere" size="{FOOT_RADIUS}" mass="0" condim="3" '
-        f'friction="{friction} 0.005 0.0001" pos="{x} {y} {FOOT_RADIUS - HEIGHT}"/>'
-        for x, y in body.feet
+        f'<geom type="sphere" size="{FOOT_RADIUS}" mass="0" condim="4" '
+        f'friction="{friction} {friction * size} 0.0001" '
+        f'pos="{x} {y} {FOOT_RADIUS - HEIGHT}"/>'
+        for (x, y), size in zip(body.feet, body.foot_size, strict=True)
     )
 
 

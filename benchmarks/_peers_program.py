@@ -8,11 +8,18 @@ from collections.abc import Callable
 import numpy as np
 from _timing import compiled
 
+from boomdp_jax.physics.body_spec import BodySpec
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 
 class NotExpressibleError(Exception):
     """An engine has no element for a part of a scene; the message says which."""
+
+
+def mean_arm(body: BodySpec) -> float:
+    """Torque of a body's ground friction against a pure spin, over its force [m]."""
+    arms = np.hypot(np.hypot(*body.feet.T), body.foot_size)
+    return float(body.foot_load @ arms)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 import pymunk
-from _peers_program import NotExpressibleError, Peer, Program
+from _peers_program import NotExpressibleError, Peer, Program, mean_arm
 
 from boomdp_jax.physics.params import WORLD
 
@@ -59,7 +59,7 @@ def _joints(spec, constraint, space, bodies) -> list[pymunk.Constraint]:
         slide = pymunk.PivotJoint(space.static_body, own, (0, 0), (0, 0))
         turn = pymunk.GearJoint(space.static_body, own, 0.0, 1.0)
         slide.max_force = limit
-        turn.max_force = limit * float(body.foot_load @ np.hypot(*body.feet.T))
+        turn.max_force = limit * mean_arm(body)
         slide.max_bias = turn.max_bias = 0.0
         return [slide, turn]
     raise NotExpressibleError(f"no {constraint.kind}")

@@ -170,6 +170,7 @@ def _block_scene(scene: Scene, bodies: tuple[int, ...], dt: np.ndarray) -> Scene
         gyration=pick(scene.gyration),
         feet=pick(scene.feet),
         foot_load=pick(scene.foot_load),
+        foot_size=None if scene.foot_size is None else pick(scene.foot_size),
         is_static=pick(scene.is_static),
         gravity=scene.gravity,
         normal_gravity=scene.normal_gravity,

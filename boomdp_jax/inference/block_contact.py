@@ -21,6 +21,7 @@ _OF_BODIES = (
     "gyration",
     "feet",
     "foot_load",
+    "foot_size",
     "is_static",
 )
 

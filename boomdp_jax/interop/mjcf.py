@@ -66,7 +66,7 @@ def world_text(truth: SceneSpec, params: Params, laws: RecordingLaws) -> str:
     _add_joints(parts, truth, params, laws, mass)
     _add_wheel(parts, params, laws, mass)
     if _has_feet(truth, params, laws):
-        _add_feet(parts, float(params.ground.dry[0, 0]), body.feet)
+        _add_feet(parts, float(params.ground.dry[0, 0]), body.feet, body.foot_size)
     covariance = body.moments.covariance
     thick = (2 * _HEIGHT) ** 2 / 12.0
     tilts = mass * (covariance[1, 1] + thick), mass * (covariance[0, 0] + thick)
@@ -146,7 +146,7 @@ def _add_joints(
     if is_pinned:
         turn.add(float(revolute.viscous[0]), float(revolute.dry[0]))
     if ground.active.any() and not _has_feet(truth, params, laws):
-        arms = np.hypot(*(body.feet - centre).T)
+        arms = np.hypot(np.hypot(*(body.feet - centre).T), body.foot_size)
         limit = float(ground.dry[0, 0])
         limit = limit if math.isinf(limit) else limit * mass * truth.normal_gravity
         viscous = float(ground.viscous[0, 0])
@@ -241,23 +241,28 @@ def _add_axle(parts: _Parts, wheel: Wheel, laws: RecordingLaws, mass: float) -> 
     parts.contacts += _pair("axle", (lateral, rolling))
 
 
-def _add_feet(parts: _Parts, friction: float, feet: np.ndarray) -> None:
+def _add_feet(
+    parts: _Parts, friction: float, feet: np.ndarray, sizes: np.ndarray
+) -> None:
     """Let the object heave and tilt, and give it feet that rub on the floor."""
     parts.joints += '<joint name="heave" type="slide" axis="0 0 1"/>'
     for name, axis in (("roll", "1 0 0"), ("pitch", "0 1 0")):
         parts.joints += f'<joint name="{name}" type="hinge" axis="{axis}"/>'
-    for i, (x, y) in enumerate(feet):
+    for i, ((x, y), size) in enumerate(zip(feet, sizes, strict=True)):
         parts.children += (
             f'<geom name="foot{i}" type="sphere" size="{FOOT_RADIUS}" mass="0" '
             f'pos="{x} {y} {FOOT_RADIUS - _HEIGHT}" contype="0" conaffinity="0"/>'
         )
-        parts.contacts += _pair(f"foot{i}", (friction, friction))
+        parts.contacts += _pair(f"foot{i}", (friction, friction), friction * size)
 
 
-def _pair(geom: str, friction: tuple[float, float]) -> str:
-    """Contact of a geom with the floor, with a coefficient for each tangent."""
+def _pair(geom: str, friction: tuple[float, float], torsion: float = 0.0) -> str:
+    """Contact of a geom with the floor, with a coefficient for each tangent.
+
+    And one against spin [m], all of which limit each other (`cone="elliptic"`).
+    """
     return (
-        f'<pair geom1="floor" geom2="{geom}" condim="3" solref="0.02 1" '
-        f'solimp="0.98 0.99 0.001" '
-        f'friction="{friction[0]} {friction[1]} 0.0001 0.0001 0.0001"/>'
+        f'<pair geom1="floor" geom2="{geom}" condim="{4 if torsion > 0.0 else 3}" '
+        f'solref="0.02 1" solimp="0.98 0.99 0.001" '
+        f'friction="{friction[0]} {friction[1]} {torsion or 1e-4} 0.0001 0.0001"/>'
     )

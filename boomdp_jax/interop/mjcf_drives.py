@@ -15,6 +15,7 @@ from boomdp_jax.interop.mjcf_elements import (
     numbers,
     velocity_force,
 )
+from boomdp_jax.physics.body_spec import BodySpec
 from boomdp_jax.physics.friction import KNEE_SPEED
 from boomdp_jax.physics.params import Params, Prismatic, Revolute
 from boomdp_jax.physics.scene_spec import SceneSpec
@@ -170,8 +171,8 @@ def add_ground(
     # A body stands under its centre of mass as its feet stand about the origin.
     center = np.zeros(2)
     if params.center_of_mass is not None:
-        center = params.center_of_mass[body]
-    arms = owner.feet - center
+        center = np.asarray(params.center_of_mass[body])
+    arms = _as_points(owner, center)
     feet = 2.0 * center + (1.0 - share) * arms + shift
     name = f"{owner.name}.ground"
     for i, (place, part) in enumerate(zip(feet, owner.foot_load, strict=True)):
@@ -188,7 +189,8 @@ def add_ground(
                 gear=along(angle),
             )
             ET.SubElement(actuators, "general", law)
-    arm = share * math.sqrt(float(owner.foot_load @ np.sum(arms**2, axis=1)))
+    square = np.sum((owner.feet - center) ** 2, axis=1) + owner.foot_size**2
+    arm = share * math.sqrt(float(owner.foot_load @ square))
     if arm > 0.0:
         ET.SubElement(element, "site", name=f"{name}.spin")
         law = velocity_force(
@@ -199,7 +201,23 @@ def add_ground(
             gear="0 0 0 0 0 1",
         )
         ET.SubElement(actuators, "general", law)
-    return [
+    notes = [
         f"{name}: the limit of a foot depends on direction, by up to 6 %, and friction "
         "of what slides is up to 22.5 degrees off its direction"
     ]
+    if np.any(owner.foot_size > 0.0):
+        notes.append(f"{name}: feet that have a size are points, a little further out")
+    return notes
+
+
+def _as_points(owner: BodySpec, center: np.ndarray) -> np.ndarray:
+    """Where a body's feet stand about its centre of mass, without their sizes.
+
+    So much further out that a pure spin meets the same torque.
+    """
+    arms = owner.feet - center
+    if not np.any(owner.foot_size > 0.0):
+        return arms
+    load, out = owner.foot_load, np.hypot(*owner.feet.T)
+    whole = load @ np.hypot(out, owner.foot_size)
+    return whole / (load @ out) * owner.feet - center

@@ -157,24 +157,34 @@ def _friction(felt: Felt, points: list[Contact], brakes: list[Spin], is_limited)
             (cos * row[0] - sin * row[1], sin * row[0] + cos * row[1], row[2])
             for row in rows
         ]
-        knee = tuple(k * is_limited for k in point.knee)
+        which = (0, 1)
+        if point.size is not None:
+            # What a foot feels of its own spin turns with no heading.
+            own = (zero, zero, point.size)
+            rows, ends, which = (*rows, own), [*ends, own], (0, 1, 1)
+        viscous, knee, weight = (
+            tuple(pair[i] for i in which)
+            for pair in (point.viscous, point.knee, point.weight)
+        )
 
-        def seen(twist, ends=ends, rows=rows, point=point):
+        def seen(twist, ends=ends, rows=rows, weight=weight):
             return tuple(
                 w * dot3(end, twist) + (1.0 - w) * dot3(row, start)
-                for w, end, row in zip(point.weight, ends, rows, strict=True)
+                for w, end, row in zip(weight, ends, rows, strict=True)
             )
 
         u = seen(now)
-        scale, slope, back = limited(u, point.viscous, knee, seen(before))
+        knee = tuple(k * is_limited for k in knee)
+        scale, slope, back = limited(u, viscous, knee, seen(before))
         num_back = num_back + back
         for i, row in enumerate(rows):
-            k = [slope[i][j] * point.weight[j] for j in range(2)]
-            force = scale * point.viscous[i] * u[i]
+            k = [slope[i][j] * weight[j] for j in range(len(rows))]
+            force = scale * viscous[i] * u[i]
             for m in range(3):
                 b[m] = b[m] - row[m] * force
                 for n in range(3):
-                    a[m][n] = a[m][n] + row[m] * (k[0] * ends[0][n] + k[1] * ends[1][n])
+                    pull = sum(k[j] * ends[j][n] for j in range(len(rows)))
+                    a[m][n] = a[m][n] + row[m] * pull
     for brake in brakes:
         knee = brake.knee * is_limited
         u, old = (

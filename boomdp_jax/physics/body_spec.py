@@ -23,7 +23,7 @@ from boomdp_jax.physics.shapes import (
     circle_moments,
     foot_loads,
     polygon_moments,
-    support_points,
+    support_feet,
 )
 
 _SHAPE_FIELDS = {"box": "half_extents", "polygon": "vertices", "circle": "radius"}
@@ -131,8 +131,16 @@ class BodySpec:
     def feet(self) -> Float[np.ndarray, "foot 2"]:
         """Where it stands on the floor, about the centre of mass [m]."""
         if self.authored_feet is None:
-            return support_points(self.moments)
+            return support_feet(self.moments)[0]
         return self.authored_feet - self.shift
+
+    @property
+    def foot_size(self) -> Float[np.ndarray, " foot"]:
+        """Size of each foot [m] (`Scene.foot_size`); feet that are given are points."""
+        if self.authored_feet is None:
+            feet, size = support_feet(self.moments)
+            return np.full(len(feet), size)
+        return np.zeros(len(self.authored_feet))
 
     @property
     def foot_load(self) -> Float[np.ndarray, " foot"]:

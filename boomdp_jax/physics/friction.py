@@ -10,7 +10,9 @@ with $C$ the viscous coefficients and $D$ the dry limits, both diagonal: viscous
 scaled back along its own direction onto the ellipse of dry limits where it lies
 outside. Its derivative is $-K$ with $K = C$ inside the ellipse and
 $K = (C - C u\,(D^{-2}C^2 u)^T / s^2)/s$ outside. A joint's friction is the same law in
-one dimension.
+one dimension, and that of a foot with a size in three: the last is the speed of its
+edge, its size times the spin. (MuJoCo's torsional friction under elliptic cones is that
+law; a foot that shrinks to a point loses it.)
 
 Everything here is constant in the body frame, so it is prepared once per rollout.
 """
@@ -63,6 +65,9 @@ class Contact(NamedTuple):
     """C over D: one over the speed at which the limit is reached [s/m]."""
     weight: tuple[PerContact, PerContact]
     """Share of the end velocity in the velocity that friction sees."""
+    size: PerContact | None = None
+    """Third row of T: velocity per spin at which it rubs where it stands [m]. Its
+    coefficients and weight are the lateral ones."""
 
 
 class Spin(NamedTuple):
@@ -88,6 +93,7 @@ class _Points(NamedTuple):
     viscous: tuple[PerContact, PerContact]
     dry: tuple[PerContact, PerContact]
     active: Bool[Array, "*contact"]
+    size: PerContact
 
 
 def wheel_headings(wheel: Wheel) -> PerContact:
@@ -104,6 +110,7 @@ def _wheel_points(wheel: Wheel) -> _Points:
         viscous=(wheel.viscous[..., 0].T, wheel.viscous[..., 1].T),
         dry=(wheel.dry[..., 0].T, wheel.dry[..., 1].T),
         active=wheel.active.T,
+        size=jnp.zeros_like(wheel.position[..., 0].T),
     )
     if wheel.half_track is None:
         return points
@@ -150,6 +157,8 @@ def _foot_points(
         """Of a foot, for each slot."""
         return jnp.tile(value.T, (num, 1))
 
+    size = scene.foot_size
+    size = jnp.zeros_like(scene.foot_load) if size is None else size
     part = tile(scene.foot_load)
     c, d = each(viscous) * part, each(limit) * part
     points = _Points(
@@ -159,8 +168,10 @@ def _foot_points(
         viscous=(c, c),
         dry=(d, d),
         active=each(active),
+        size=(1.0 - each(share)) * tile(size),
     )
-    square = jnp.sum(scene.foot_load * jnp.sum(scene.feet**2, axis=-1), axis=-1)
+    square = jnp.sum(scene.feet**2, axis=-1) + size**2
+    square = jnp.sum(scene.foot_load * square, axis=-1)
     arm = jnp.sqrt(jnp.where(square > 0, square, 1.0))
     arm = share * jnp.where(square > 0, arm, 0.0)[None]
     has_arm = arm > 0
@@ -182,12 +193,13 @@ def friction_points(
         Contacts and spins `[contact, body]`, without the implicit weights (all one);
         None where there are none.
     """
-    parts, spins = [], None
+    parts, spins, has_size = [], None, False
     if params.wheel.active.shape[-1]:
         parts.append(_wheel_points(params.wheel))
     if params.ground.active.shape[-1]:
         feet, torque = _foot_points(scene, params.ground, mass)
         parts.append(feet)
+        has_size = scene.foot_size is not None
         spins = None if params.ground.torque_share is None else torque
     if not parts:
         return None, spins
@@ -206,6 +218,7 @@ def friction_points(
         viscous=(c[0], c[1]),
         knee=(knee[0], knee[1]),
         weight=(one, one),
+        size=points.size if has_size else None,
     )
     return contact, spins
 
@@ -239,7 +252,7 @@ def limited(u: tuple, viscous: tuple, knee: tuple, before: tuple | None = None):
     """Scale of the viscous force, and the derivative K of the force.
 
     Args:
-        u: contact velocity, one or two components [m/s].
+        u: contact velocity, one to three components [m/s].
         viscous: C, as many.
         knee: C over D, as many.
         before: u in the iteration before, if there is one (see `is_reversed`).

@@ -150,6 +150,10 @@ def fit_weights(
                 [damping[i][j] + jnp.sum(v * row[i] * row[j], axis=0) for j in range(3)]
                 for i in range(3)
             ]
+        if contacts.size is not None:
+            # Less stiff than the feet's own directions: no bound is needed.
+            own = jnp.sum(contacts.viscous[1] * contacts.size**2, axis=0)
+            damping[2][2] = damping[2][2] + own
     if spins is not None:
         scale = mobile[None] * least(spins.viscous, 1.0 / inertia[None])
         spins = spins._replace(
@@ -179,6 +183,13 @@ def fit_weights(
             tuple(c * part for part in eases(row))
             for c, row in zip(contacts.viscous, rows, strict=True)
         ]
+        if contacts.size is not None:
+            none = jnp.zeros_like(contacts.size)
+            own = eases((none, none, contacts.size))
+            parts[1] = tuple(
+                part + contacts.viscous[1] * extra
+                for part, extra in zip(parts[1], own, strict=True)
+            )
         ease, loss = (
             groups.shared(pair, lambda values: jnp.sum(values, axis=0))
             for pair in zip(*parts, strict=True)

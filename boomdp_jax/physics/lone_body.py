@@ -200,6 +200,10 @@ def _feet(feet: list[Contact], anchor: Pair, axis: Pair | None) -> Feet:
             into(axis, foot.rolling[2] + anchor[1], foot.lateral[2] - anchor[0])
             for foot in feet
         ],
+        sizes=[
+            jnp.zeros_like(foot.viscous[0]) if foot.size is None else foot.size
+            for foot in feet
+        ],
         viscous=[foot.viscous[0] for foot in feet],
         knee=knee,
         share=feet[0].weight[0],
@@ -223,8 +227,11 @@ def _stuck(
         for reach in track.reach:
             add(track.heading, *track.viscous, reach, track.lead, track.share)
     for patch in feet:
-        for (p, q), c in zip(patch.arms, patch.viscous, strict=True):
-            add(None, c, c, p, q, (patch.share, patch.share))
+        share = patch.share
+        for (p, q), g, c in zip(patch.arms, patch.sizes, patch.viscous, strict=True):
+            add(None, c, c, p, q, (share, share))
+            end[8] = end[8] + c * g * g * share
+            start[8] = start[8] + c * g * g * (1.0 - share)
     for brake in brakes:
         end[8] = end[8] + brake.viscous * brake.share
         start[8] = start[8] + brake.viscous * (1.0 - brake.share)

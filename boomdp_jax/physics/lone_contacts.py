@@ -2,9 +2,10 @@ r"""What rubs on the floor under a lone body: wheels on one axle, and feet.
 
 Both share what they can, which is what makes them cheap. The wheels of an axle have one
 heading and one set of coefficients and differ by their arm only; feet rub alike in
-every direction, so in any frame. Both see a blend of the motions at the end and at the
-start of a step with shares that all of them have in common (`implicit_fit`), so what
-each sees follows from one blended motion of the body.
+every direction, so in any frame, and where they have a size against their own spin.
+Both see a blend of the motions at the end and at the start of a step with shares that
+all of them have in common (`implicit_fit`), so what each sees follows from one blended
+motion of the body.
 
 With f the force law (`friction`), $s > 1$ where it slips, $\sigma = \min(1, 1/s)$ and
 $b = [s > 1]\,\sigma^2 D^{-2} C^2 u$, its derivative is $K = \sigma C - f\,b^T$, and
@@ -47,6 +48,8 @@ class Feet(NamedTuple):
 
     arms: list[Pair]
     """Velocity of each per spin about the anchor [m]."""
+    sizes: list[FloatScalar]
+    """Velocity of its edge per spin, which rubs where it stands [m]."""
     viscous: list[FloatScalar]
     knee: FloatScalar
     share: FloatScalar
@@ -118,10 +121,11 @@ def feet_force(feet: Feet, motions: Motions) -> Triple:
     """Generalised force that feet oppose to a motion."""
     ux, uy, spin = feet_motion(feet, motions.end, motions.start)
     x = y = moment = jnp.zeros_like(spin)
-    for (p, q), c in zip(feet.arms, feet.viscous, strict=True):
-        u, v = ux + p * spin, uy + q * spin
-        c = c * slip_scale(feet.knee * feet.knee * (u * u + v * v))
-        x, y, moment = x + c * u, y + c * v, moment + c * (p * u + q * v)
+    for (p, q), g, c in zip(feet.arms, feet.sizes, feet.viscous, strict=True):
+        u, v, edge = ux + p * spin, uy + q * spin, g * spin
+        c = c * slip_scale(feet.knee * feet.knee * (u * u + v * v + edge * edge))
+        turn = p * u + q * v + g * edge
+        x, y, moment = x + c * u, y + c * v, moment + c * turn
     return x, y, moment
 
 
@@ -172,19 +176,20 @@ def feet_sums(feet: Feet, motions: Motions) -> Sums:
     knee, share, old, parts = feet.knee, feet.share, None, []
     if motions.before is not None:
         old = feet_motion(feet, motions.before, motions.start)
-    for (p, q), c in zip(feet.arms, feet.viscous, strict=True):
-        u, v = ux + p * spin, uy + q * spin
-        square = (knee * u) ** 2 + (knee * v) ** 2
+    for (p, q), g, c in zip(feet.arms, feet.sizes, feet.viscous, strict=True):
+        u, v, edge = ux + p * spin, uy + q * spin, g * spin
+        ratio = (knee * u, knee * v, knee * edge)
+        square = ratio[0] ** 2 + ratio[1] ** 2 + ratio[2] ** 2
         back = jnp.zeros_like(square)
         if old is not None:
-            past = (knee * (old[0] + p * old[2]), knee * (old[1] + q * old[2]))
-            is_back = is_reversed((knee * u, knee * v), past)
+            past = (old[0] + p * old[2], old[1] + q * old[2], g * old[2])
+            is_back = is_reversed(ratio, tuple(knee * v for v in past))
             square = jnp.where(is_back, 1.0, square)
             back = jnp.where(is_back, 1.0, back)
         scale = slip_scale(square)
-        c, ratio = scale * c, knee * scale
-        loss = jnp.where(scale < 1.0, c * ratio * ratio, 0.0)
-        turn = p * u + q * v
+        c, bend = scale * c, knee * scale
+        loss = jnp.where(scale < 1.0, c * bend * bend, 0.0)
+        turn = p * u + q * v + g * edge
         parts.append(
             (
                 c - loss * u * u,
@@ -192,7 +197,7 @@ def feet_sums(feet: Feet, motions: Motions) -> Sums:
                 c * p - loss * u * turn,
                 c - loss * v * v,
                 c * q - loss * v * turn,
-                c * (p * p + q * q) - loss * turn * turn,
+                c * (p * p + q * q + g * g) - loss * turn * turn,
                 *(c * u, c * v, c * turn, back),
             )
         )

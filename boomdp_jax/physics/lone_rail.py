@@ -108,9 +108,9 @@ def rail_params(scene: Scene, params: Params) -> tuple[Scene, Params]:
         params: of which `can_be_on_rail` holds.
 
     Returns:
-        The scene with feet at the centre of mass where a drawer is active, and params
-        with wheels there along its line, one more for its own friction, its pin
-        inactive, and no drawers or welds.
+        The scene with points for feet, at the centre of mass, where a drawer is active,
+        and params with wheels there along its line, one more for its own friction, its
+        pin inactive, and no drawers or welds.
     """
     guide, ground, pin = params.prismatic, params.ground, params.revolute
     if guide is None or guide.active.shape[0] == 0:
@@ -130,7 +130,8 @@ def rail_params(scene: Scene, params: Params) -> tuple[Scene, Params]:
         prismatic=None,
         weld=None,
     )
-    return _replaced(scene, feet=unless(scene.feet)), params
+    size = None if scene.foot_size is None else unless(scene.foot_size)
+    return _replaced(scene, feet=unless(scene.feet), foot_size=size), params
 
 
 def before_step(

@@ -34,6 +34,9 @@ class Scene(eqx.Module):
     collides: Bool[Array, "*batch body body"] | None = None
     """Which bodies may touch each other, symmetric; None: there is no contact. Bodies
     that a joint connects do not touch, whatever this says."""
+    foot_size: Float[Array, "*batch body foot"] | None = None
+    """Lever of a foot's friction against its own spin, zero for a point [m]: it rubs at
+    the speed sqrt(v² + size² spin²). None: all are points."""
     smoothing: Float[Array, "*batch"] | None = None
     """Speed s by which contact is smoothed [m/s]; None: not at all. Bodies then push
     each other before they touch, at a gap d with an acceleration of s²/d, and friction

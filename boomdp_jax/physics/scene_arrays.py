@@ -27,7 +27,7 @@ from boomdp_jax.physics.scene import Scene
 MIN_VERTICES = 4
 """Least room for corners, so that scenes of boxes, triangles and circles stack."""
 
-MIN_FEET = 4
+MIN_FEET = 9
 """Least room for feet, likewise."""
 
 
@@ -62,7 +62,10 @@ def build_scene(
     vertex_mask = [np.arange(num_vertices) < len(body.outline) for body in bodies]
     vertices = [_pad_with_last(body.vertices, num_vertices) for body in bodies]
     feet = [_pad_with_last(body.feet, num_feet) for body in bodies]
-    loads = [np.pad(body.foot_load, (0, num_feet - len(body.feet))) for body in bodies]
+    loads, sizes = (
+        [np.pad(part, (0, num_feet - len(part))) for part in parts]
+        for parts in zip(*((b.foot_load, b.foot_size) for b in bodies), strict=True)
+    )
     # Concrete arrays even under a trace: the caller keeps them.
     with jax.ensure_compile_time_eval():
         return Scene(
@@ -73,6 +76,7 @@ def build_scene(
             gyration=on_device([body.gyration for body in bodies]),
             feet=on_device(np.stack(feet)),
             foot_load=on_device(np.stack(loads)),
+            foot_size=on_device(np.stack(sizes)),
             is_static=on_device([body.is_static for body in bodies], bool),
             gravity=on_device(gravity),
             normal_gravity=on_device(normal_gravity),

@@ -10,7 +10,7 @@ from boomdp_jax.physics.shapes import (
     circle_moments,
     foot_loads,
     polygon_moments,
-    support_points,
+    support_feet,
 )
 
 
@@ -83,20 +83,81 @@ def test_moments_do_not_depend_on_where_the_outline_lies():
     np.testing.assert_allclose(far.covariance, near.covariance, rtol=1e-6)
 
 
+def inside(corners, num=300):
+    """Points of a fine grid that lie in a convex outline."""
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    share = (np.arange(num) + 0.5) / num
+    grid = np.stack(np.meshgrid(share, share), axis=-1).reshape(-1, 2)
+    points = low + grid * (high - low)
+    edges = np.roll(corners, -1, axis=0) - corners
+    ahead = points[:, None] - corners[None]
+    cross = edges[:, 0] * ahead[..., 1] - edges[:, 1] * ahead[..., 0]
+    return points[np.all(cross > 0, axis=1)]
+
+
 @pytest.mark.parametrize("seed", range(4))
-def test_support_points_have_the_second_moments_of_the_outline(seed: int):
-    moments = polygon_moments(_random_convex(seed))
-    feet = support_points(moments)
+def test_reach_is_the_mean_distance_from_the_centroid(seed: int):
+    corners = _random_convex(seed)
+    moments = polygon_moments(corners)
+    distance = np.linalg.norm(inside(corners) - moments.centroid, axis=1)
+    assert moments.reach == pytest.approx(np.mean(distance), rel=2e-3)
+
+
+def test_reach_of_a_square_and_of_a_disc_is_that_of_the_tables():
+    square = polygon_moments(box_outline(np.array([0.5, 0.5])))
+    assert square.reach == pytest.approx((np.sqrt(2) + np.arcsinh(1)) / 6)
+    assert circle_moments(0.3).reach == pytest.approx(0.2)
+    assert polygon_moments(_regular(360)).reach == pytest.approx(2 / 3, rel=1e-4)
+
+
+OUTLINES = {
+    "disc": (_regular(360), 0.025),
+    "square": (box_outline(np.array([0.2, 0.2])), 0.025),
+    "box": (box_outline(np.array([0.6, 0.3])), 0.025),
+    "plank": (box_outline(np.array([1.0, 0.1])), 0.06),
+    "polygon": (_random_convex(2), 0.05),
+}
+
+
+@pytest.mark.parametrize("name", OUTLINES)
+def test_feet_of_an_outline_rub_as_all_of_it_does(name: str):
+    """Friction of an even pressure, integrated, in every ratio of spin to speed."""
+    corners, most = OUTLINES[name]
+    moments = polygon_moments(corners)
+    points = inside(corners) - moments.centroid
+    feet, size = support_feet(moments)
     np.testing.assert_allclose(np.mean(feet, axis=0), 0.0, atol=1e-12)
-    np.testing.assert_allclose(feet.T @ feet / 4, moments.covariance, atol=1e-12)
+    rng = np.random.default_rng(0)
+    misses = []
+    for _ in range(200):
+        angle = rng.uniform(-np.pi, np.pi)
+        velocity = np.array([np.cos(angle), np.sin(angle)])
+        spin = np.exp(1.2 * rng.normal() + 0.5) / np.max(np.hypot(*points.T))
+
+        def force(place, lever, velocity=velocity, spin=spin):
+            turn = np.stack([-place[:, 1], place[:, 0]], axis=1)
+            speed = velocity + spin * turn
+            total = np.sqrt(np.sum(speed**2, axis=1) + (lever * spin) ** 2)
+            torque = (np.sum(speed * turn, axis=1) + lever**2 * spin) / total
+            x, y = np.mean(speed / total[:, None], axis=0)
+            return np.array([x, y, np.mean(torque) / moments.reach])
+
+        misses.append(np.sum((force(points, 0.0) - force(feet, size)) ** 2))
+    assert np.sqrt(np.mean(misses)) < most
 
 
-def test_support_points_of_a_box_lie_along_its_sides():
-    feet = support_points(polygon_moments(box_outline(np.array([0.6, 0.3]))))
-    expected = box_outline(np.array([0.6, 0.3])) / np.sqrt(3)
-    np.testing.assert_allclose(
-        sorted(feet.round(12).tolist()), sorted(expected.round(12).tolist())
-    )
+def test_feet_resist_a_pure_spin_as_all_of_the_outline_does():
+    moments = polygon_moments(_random_convex(1))
+    feet, size = support_feet(moments)
+    arms = np.hypot(np.hypot(*feet.T), size)
+    assert np.mean(arms) == pytest.approx(moments.reach, rel=1e-12)
+
+
+def test_feet_of_a_box_stand_about_the_middles_of_equal_parts():
+    feet, _ = support_feet(polygon_moments(box_outline(np.array([0.6, 0.3]))))
+    rows, columns = (np.unique(np.round(feet[:, axis], 9)) for axis in (1, 0))
+    np.testing.assert_allclose(rows, [-0.95 * 0.2, 0.0, 0.95 * 0.2], atol=1e-9)
+    np.testing.assert_allclose(columns, [-0.95 * 0.4, 0.0, 0.95 * 0.4], atol=1e-9)
 
 
 def test_loads_on_three_feet_are_the_lever_rule():
