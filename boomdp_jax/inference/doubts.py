@@ -6,6 +6,7 @@ from boomdp_jax.inference.posterior import Posterior, with_diagnostics
 from boomdp_jax.inference.run_breaks import run_break_reasons
 from boomdp_jax.inference.still import still_notes
 from boomdp_jax.inference.unread import unread_notes
+from boomdp_jax.inference.unread_angles import angle_reasons
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 
@@ -28,7 +29,11 @@ def with_doubts(
         history: its readings.
         notes: further ones.
     """
-    reasons = [*run_break_reasons(spec, history), *lever_reasons(spec, posterior)]
+    reasons = [
+        *run_break_reasons(spec, history),
+        *lever_reasons(spec, posterior),
+        *angle_reasons(spec, history, posterior),
+    ]
     if reasons:
         posterior = with_diagnostics(posterior, reasons)
     notes = [*unread_notes(spec, history), *still_notes(spec, history), *notes]

@@ -106,8 +106,9 @@ def track_data(
             by one.
 
     Returns:
-        The readings. A missing first reading of a track is replaced by the mean
-        position, or by rest; how little is known of it is up to the filter.
+        The readings. A missing first reading of a track is replaced by the next one of
+        that run, where there is none by the mean position, or by rest; how little is
+        known of it is up to the filter.
     """
     index = np.asarray(bodies)
     trusted = history if freedom is None else without_isolated(history)
@@ -126,12 +127,40 @@ def track_data(
     num = np.maximum(np.sum(first, axis=0), 1)
     mean = np.sum(np.where(first, state, 0.0), axis=0) / num
     guess = np.where(np.arange(6)[None] < 3, mean, 0.0)
+    guess = np.where(first, state, guess[None])
+    later = np.asarray(trusted.next_state_mask)[:, index] & rows[:, None, None]
+    _fill_poses(guess, first, np.asarray(steps.next_state), later, goes_on)
     return TrackData(
         steps=steps,
         first_mask=on_device(first, dtype),
         last_mask=on_device(last, dtype),
         is_start=on_device(~goes_on, dtype),
         is_second=on_device(goes_on & ~np.asarray(history.is_chained), dtype),
-        start=on_device(np.where(first, state, guess[None]), dtype),
+        start=on_device(guess, dtype),
         freedom=freedom,
     )
+
+
+def _fill_poses(
+    start: np.ndarray,
+    first: np.ndarray,
+    after: np.ndarray,
+    last: np.ndarray,
+    goes_on: np.ndarray,
+) -> None:
+    """Put the next reading of a run in place of first ones that are missing, of poses.
+
+    The filter takes derivatives about it, and those about an angle that is off by a
+    radian mean nothing.
+    """
+    if np.all(first[~goes_on][..., :3]):
+        return
+    is_known, value = first[..., :3].copy(), start[..., :3]
+    for row in reversed(range(len(start))):
+        choices = [(last[row, :, :3], after[row, :, :3])]
+        if row + 1 < len(start) and goes_on[row + 1]:
+            choices.append((is_known[row + 1], value[row + 1]))
+        for is_there, other in choices:
+            is_new = is_there & ~is_known[row]
+            value[row] = np.where(is_new, other, value[row])
+            is_known[row] |= is_new

@@ -1,5 +1,6 @@
 """Bodies without a single reading: what is said of them, and what is refused."""
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -7,7 +8,9 @@ import pytest
 from boomdp_jax.core.history import History, make_history
 from boomdp_jax.inference import infer
 from boomdp_jax.inference.likelihoods import choose_likelihood
+from boomdp_jax.inference.track_data import track_data
 from boomdp_jax.inference.unread import unread_bodies, unread_notes
+from boomdp_jax.inference.unread_angles import angle_reasons
 from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
 from tests.inference.recordings import DT, SIZE, box_scene, free_box
 
@@ -92,3 +95,54 @@ def test_the_posterior_says_of_whom_nothing_was_read():
         assert bodies["a"]["identified"]
         assert not bodies["b"]["identified"]
         assert "nothing was read" in found.summary()
+
+
+def turning_box(num_rows: int = 12) -> dict[str, np.ndarray]:
+    """Readings of a body that turns by a tenth of a radian a step, from 1.3 on."""
+    time = np.arange(num_rows + 1)
+    reading = np.zeros((num_rows + 1, 1, 6))
+    reading[:, 0, 0], reading[:, 0, 2], reading[:, 0, 5] = 0.01 * time, 1.3, 5.0
+    reading[:, 0, 2] += 0.1 * time
+    action = np.zeros((num_rows, 1, 3))
+    return {
+        "state": reading[:-1].copy(),
+        "action": action,
+        "next_state": reading[1:].copy(),
+    }
+
+
+def test_a_track_whose_first_angle_is_missing_starts_near_the_next_one():
+    rows = turning_box()
+    episode = np.repeat([0, 1], 6)
+    # The second run lacks its first two instants, the first one a single channel.
+    rows["state"][0, 0, 2] = np.nan
+    rows["state"][6:8], rows["next_state"][6] = np.nan, np.nan
+    history = make_history(**rows, dt=DT, episode=episode)
+    track = track_data(history, (0,), True)
+    assert np.asarray(track.is_start)[[0, 6]].all()
+    start = np.asarray(track.start)[:, 0]
+    np.testing.assert_allclose(start[0, :3], [0.0, 0.0, 1.4], atol=1e-6)
+    np.testing.assert_allclose(start[6, :3], [0.08, 0.0, 2.1], atol=1e-6)
+    # What was not read counts as little as before.
+    assert not np.any(np.asarray(track.first_mask)[6])
+
+
+@pytest.mark.slow
+def test_where_no_angle_was_read_joints_and_wheels_are_doubted():
+    """A pin and a wheel may move a dot alike."""
+    spec = box_scene({"revolute": 1})
+    history = free_box(np.random.default_rng(0), 12)
+    read = np.array(history.state), np.array(history.next_state)
+    found = infer(KEY, spec, history, method="laplace")
+    assert angle_reasons(spec, history, found) == []
+    for array in read:
+        array[..., [2, 5]] = np.nan
+    blind = make_history(read[0], history.action, read[1], DT)
+    active = np.ones_like(found.params.revolute.active)
+    pinned = eqx.tree_at(lambda p: p.params.revolute.active, found, active)
+    reasons = angle_reasons(spec, blind, pinned)
+    assert len(reasons) == 1
+    assert "its angle was never read" in reasons[0]
+    assert "probability 1.00" in reasons[0]
+    free = eqx.tree_at(lambda p: p.params.revolute.active, found, ~active)
+    assert angle_reasons(spec, blind, free) == []
