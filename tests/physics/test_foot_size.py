@@ -123,6 +123,7 @@ def test_both_paths_rub_alike():
     assert np.max(worst) < 1e-3
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences():
     params, state, wrench = case(jax.random.key(3))
     ground = type(params.ground)(

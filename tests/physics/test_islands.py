@@ -135,6 +135,7 @@ def test_what_contact_brings_is_not_taken_away():
     assert kinetic[-1] > 0.1
 
 
+@pytest.mark.slow
 def test_many_islands_are_what_each_is_alone(alone):
     together = run(ISLANDS.values())[:, :-1]
     expected = np.concatenate(list(alone.values()), axis=1)

@@ -99,6 +99,7 @@ def test_steps_that_the_line_tells_nothing_of_are_taken_whole(worlds, monkeypatc
         assert float(jnp.max(left)) < 1e-6
 
 
+@pytest.mark.slow
 def test_the_rest_of_a_batch_changes_no_bit(worlds):
     scene, params, pose, twist, wrench = worlds
 
