@@ -15,7 +15,6 @@ from boomdp_jax.interop.mjcf_elements import (
     numbers,
     velocity_force,
 )
-from boomdp_jax.physics.body_spec import BodySpec
 from boomdp_jax.physics.friction import KNEE_SPEED
 from boomdp_jax.physics.params import Params, Prismatic, Revolute
 from boomdp_jax.physics.scene_spec import SceneSpec
@@ -172,10 +171,12 @@ def add_ground(
     center = np.zeros(2)
     if params.center_of_mass is not None:
         center = np.asarray(params.center_of_mass[body])
-    arms = _as_points(owner, center)
+    arms = owner.feet - center
     feet = 2.0 * center + (1.0 - share) * arms + shift
+    sizes = (1.0 - share) * owner.foot_size
+    feet, loads = _as_points(feet, sizes, owner.foot_load)
     name = f"{owner.name}.ground"
-    for i, (place, part) in enumerate(zip(feet, owner.foot_load, strict=True)):
+    for i, (place, part) in enumerate(zip(feet, loads, strict=True)):
         if part <= 0.0:
             continue
         site = f"{name}.foot{i}"
@@ -189,7 +190,7 @@ def add_ground(
                 gear=along(angle),
             )
             ET.SubElement(actuators, "general", law)
-    square = np.sum((owner.feet - center) ** 2, axis=1) + owner.foot_size**2
+    square = np.sum(arms**2, axis=1) + owner.foot_size**2
     arm = share * math.sqrt(float(owner.foot_load @ square))
     if arm > 0.0:
         ET.SubElement(element, "site", name=f"{name}.spin")
@@ -206,18 +207,20 @@ def add_ground(
         "of what slides is up to 22.5 degrees off its direction"
     ]
     if np.any(owner.foot_size > 0.0):
-        notes.append(f"{name}: feet that have a size are points, a little further out")
+        notes.append(f"{name}: two points stand for each foot that has a size")
     return notes
 
 
-def _as_points(owner: BodySpec, center: np.ndarray) -> np.ndarray:
-    """Where a body's feet stand about its centre of mass, without their sizes.
+def _as_points(
+    feet: np.ndarray, sizes: np.ndarray, loads: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Feet and their loads, as two points at opposite edges each that has a size.
 
-    So much further out that a pure spin meets the same torque.
+    Below the limit that is the same law; beyond, edges of half of the feet lie along
+    one axis and those of the others along the other one, so that none is preferred.
     """
-    arms = owner.feet - center
-    if not np.any(owner.foot_size > 0.0):
-        return arms
-    load, out = owner.foot_load, np.hypot(*owner.feet.T)
-    whole = load @ np.hypot(out, owner.foot_size)
-    return whole / (load @ out) * owner.feet - center
+    if not np.any(sizes > 0.0):
+        return feet, loads
+    is_odd = np.arange(len(feet)) % 2 == 1
+    edge = sizes[:, None] * np.stack([~is_odd, is_odd], axis=1)
+    return np.concatenate([feet + edge, feet - edge]), np.tile(0.5 * loads, 2)

@@ -137,7 +137,7 @@ def pinned_box(rng: np.random.Generator, num_rows: int):
     return spec, make_history(noisy[:-1, None], action, noisy[1:, None], DT)
 
 
-NUM_PARTICLES = 100_000
+NUM_PARTICLES = 400_000
 
 
 def by_particles(spec, history: History, twist_sd=None) -> list[float]:
