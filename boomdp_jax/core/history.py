@@ -1,5 +1,7 @@
 """What was observed: a fixed-capacity, masked table of transitions."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,10 +18,17 @@ from boomdp_jax.core.checked_input import (
     whole_number,
 )
 
-SAME_READING = 1e-6
-"""Two readings of an instant are one where all channels agree within this, as a share
-or in m, rad, m/s or rad/s: one that was rounded to single precision on its way, or to
-six decimals in a text file. Taken for two they would tell of sensors without noise."""
+_SAME_READING = 1e-6
+
+
+def is_same_reading(one: Any, other: Any) -> Any:
+    """Whether numbers read at one instant are one reading, up to rounding.
+
+    One that was rounded to single precision on its way, or to six decimals in a text
+    file, differs by up to a millionth, as a share or in m, rad, m/s or rad/s. Taken for
+    two readings they would tell of sensors without noise.
+    """
+    return abs(one - other) <= _SAME_READING * (1.0 + abs(one))
 
 
 class Transition(eqx.Module):
@@ -41,7 +50,7 @@ class History(eqx.Module):
 
     Missing readings are masked channel by channel and hold zero. `is_chained[t]` says
     that the reading `state[t]` is the very reading `next_state[t - 1]`, up to rounding
-    (`SAME_READING`).
+    (`is_same_reading`).
     """
 
     state: Float[Array, "*batch time body 6"]
@@ -199,8 +208,8 @@ def make_history(
     is_chained = np.zeros(num_rows, bool)
     if num_rows > 1:
         now, before = state[1:], next_state[:-1]
-        close = np.abs(now - before) <= SAME_READING * np.maximum(1.0, np.abs(now))
-        same = np.all(close | (np.isnan(now) & np.isnan(before)), axis=(1, 2))
+        is_missing = np.isnan(now) & np.isnan(before)
+        same = np.all(is_same_reading(now, before) | is_missing, axis=(1, 2))
         is_chained[1:] = same & (episode[1:] == episode[:-1])
 
     def pad(array, fill=0):

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar, on_device
 from boomdp_jax.core.checked_input import positive_seconds
-from boomdp_jax.core.history import SAME_READING, History
+from boomdp_jax.core.history import History, is_same_reading
 from boomdp_jax.inference.track_data import TrackData, TrackRow
 
 
@@ -84,8 +84,7 @@ def new_row(
     state = jnp.where(first, state, 0.0).astype(history.state.dtype)
     next_state = jnp.where(last, next_state, 0.0).astype(history.state.dtype)
     before = jnp.maximum(num_rows - 1, 0)
-    most = SAME_READING * jnp.maximum(1.0, jnp.abs(state))
-    is_same = jnp.all(jnp.abs(state - history.next_state[before]) <= most)
+    is_same = jnp.all(is_same_reading(state, history.next_state[before]))
     is_same = is_same & jnp.all(first == history.next_state_mask[before])
     starts_episode = starts_episode | (num_rows == 0) | ~is_pushed
     return NewRow(

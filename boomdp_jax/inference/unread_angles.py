@@ -18,8 +18,8 @@ def angle_reasons(spec: SceneSpec, history: History, posterior: Posterior) -> li
     """Reasons for doubt about constraints of bodies whose angle was never read.
 
     A filter follows a body from an angle that is roughly known. Where it is not, the
-    same positions may be those of a pin and those of a wheel, and what is found first
-    stays.
+    same positions may be those of a pin, of a wheel, or of a heavier body that is free,
+    and what is found first stays, whatever its probability.
 
     Args:
         spec: the scene.
@@ -27,7 +27,7 @@ def angle_reasons(spec: SceneSpec, history: History, posterior: Posterior) -> li
         posterior: what was inferred of it.
 
     Returns:
-        One line for each body that may be held, or roll, in a direction.
+        One line for each body that may have a joint or a wheel.
     """
     rows = np.asarray(history.mask)
     is_read = np.zeros((spec.num_bodies, 6), bool)
@@ -35,14 +35,15 @@ def angle_reasons(spec: SceneSpec, history: History, posterior: Posterior) -> li
         is_read |= np.any(np.asarray(mask)[rows], axis=0)
     is_unread = np.any(is_read, axis=1) & ~is_read[:, _ANGLE]
     is_unread &= ~np.asarray(spec.is_static)
+    may_be_held = any(spec.unknown.get(kind, 0) for kind in ("wheel", *_OF_TWO))
     weights, reasons = np.asarray(posterior.weights), []
     for body in np.flatnonzero(is_unread):
         probability = weights @ _is_held(posterior, int(body))
-        if probability >= _LEAST:
+        if may_be_held or probability >= _LEAST:
             reasons.append(
-                f"{spec.names[body]}: its angle was never read; joints and wheels of "
-                f"it, of probability {probability:.2f}, and its mass are not to be "
-                "relied on: expected some readings of the angle"
+                f"{spec.names[body]}: its angle was never read; whether it has a joint "
+                f"or a wheel, here with probability {probability:.2f}, and its mass "
+                "are not to be relied on: expected some readings of the angle"
             )
     return reasons
 

@@ -130,17 +130,20 @@ class BodySpec:
     @property
     def feet(self) -> Float[np.ndarray, "foot 2"]:
         """Where it stands on the floor, about the centre of mass [m]."""
-        if self.authored_feet is None:
-            return support_feet(self.moments)[0]
-        return self.authored_feet - self.shift
+        return self._stance[0]
 
     @property
     def foot_size(self) -> Float[np.ndarray, " foot"]:
         """Size of each foot [m] (`Scene.foot_size`); feet that are given are points."""
-        if self.authored_feet is None:
-            feet, size = support_feet(self.moments)
-            return np.full(len(feet), size)
-        return np.zeros(len(self.authored_feet))
+        return self._stance[1]
+
+    @functools.cached_property
+    def _stance(self) -> tuple[Float[np.ndarray, "foot 2"], Float[np.ndarray, " foot"]]:
+        """Where its feet are, and how large."""
+        if self.authored_feet is not None:
+            return self.authored_feet - self.shift, np.zeros(len(self.authored_feet))
+        feet, size = support_feet(self.moments)
+        return feet, np.full(len(feet), size)
 
     @property
     def foot_load(self) -> Float[np.ndarray, " foot"]:

@@ -62,10 +62,8 @@ def build_scene(
     vertex_mask = [np.arange(num_vertices) < len(body.outline) for body in bodies]
     vertices = [_pad_with_last(body.vertices, num_vertices) for body in bodies]
     feet = [_pad_with_last(body.feet, num_feet) for body in bodies]
-    loads, sizes = (
-        [np.pad(part, (0, num_feet - len(part))) for part in parts]
-        for parts in zip(*((b.foot_load, b.foot_size) for b in bodies), strict=True)
-    )
+    loads = [_pad_with_zeros(body.foot_load, num_feet) for body in bodies]
+    sizes = [_pad_with_zeros(body.foot_size, num_feet) for body in bodies]
     # Concrete arrays even under a trace: the caller keeps them.
     with jax.ensure_compile_time_eval():
         return Scene(
@@ -199,6 +197,10 @@ def _collides(bodies: Sequence[BodySpec]) -> jax.Array | None:
     groups = [body.group for body in bodies]
     table = [[g is None or g != h for h in groups] for g in groups]
     return on_device(np.array(table) & ~np.eye(len(bodies), dtype=bool), bool)
+
+
+def _pad_with_zeros(values: np.ndarray, num: int) -> np.ndarray:
+    return np.pad(values, (0, num - len(values)))
 
 
 def _pad_with_last(points: np.ndarray, num: int) -> np.ndarray:
