@@ -6,11 +6,13 @@ from collections.abc import Callable
 import numpy as np
 
 from boomdp_jax.core.history import History
+from boomdp_jax.inference.tie_misfit import pin_misfit, rod_range, slide_misfit
 from boomdp_jax.inference.touching import Touching
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 # A pair whose best common pin misses by more than this [m], root mean square, is not
-# tied: thirty times what a camera resolves.
+# tied: thirty times what a camera resolves. Coarser readings are allowed for besides
+# (`tie_misfit`).
 TIE_TOLERANCE = 0.03
 
 
@@ -59,20 +61,22 @@ def independent_blocks(
         rows = np.asarray(history.mask)
         state = np.asarray(history.state, float)[rows]
         seen = np.asarray(history.state_mask)[rows]
+        run = np.asarray(history.episode)[rows]
         for a, b in itertools.combinations(movable, 2):
             use = np.all(seen[:, [a, b], :3], axis=(1, 2))
-            misfit = _pin_misfit(state[use, a], state[use, b])
-            is_tied = bool(can_pin) and misfit < TIE_TOLERANCE
+            pair = state[use, a], state[use, b]
+            misfit = pin_misfit(*pair, run[use])
+            is_tied = bool(can_pin) and misfit.may_be(TIE_TOLERANCE)
             if can_rod and not is_tied:
-                is_tied = _may_be_rod(spec, state[use], a, b)
+                is_tied = _may_be_rod(spec, state[use], a, b, run[use])
             if can_slide and not is_tied:
-                reach = spec.bodies[a].reach
-                miss = _slide_misfit(state[use, a], state[use, b], reach)
-                is_tied = miss < TIE_TOLERANCE
+                miss = slide_misfit(*pair, spec.bodies[a].reach, run[use])
+                is_tied = miss.may_be(TIE_TOLERANCE)
             if is_tied:
                 parent[root(a)] = root(b)
             else:
-                dropped.append(f"{spec.names[a]}-{spec.names[b]} ({misfit:.3g} m)")
+                names = f"{spec.names[a]}-{spec.names[b]}"
+                dropped.append(f"{names} ({misfit.raw:.3g} m)")
     blocks: dict[int, list[int]] = {}
     for i in movable:
         blocks.setdefault(root(i), []).append(i)
@@ -92,43 +96,12 @@ def _join_touching(touching: Touching, parent: dict, root: Callable) -> None:
         parent[root(a)] = root(b)
 
 
-def _pin_misfit(a: np.ndarray, b: np.ndarray) -> float:
-    """Root mean square miss of the best common pin [m]; zero without data."""
-    if len(a) == 0:
-        return 0.0
-    left, right = _rotations(a[:, 2]), _rotations(b[:, 2])
-    matrix = np.concatenate([left, -right], axis=-1).reshape(-1, 4)
-    offset = (a[:, :2] - b[:, :2]).reshape(-1)
-    solution = np.linalg.lstsq(matrix, -offset, rcond=1e-6)[0]
-    return float(np.sqrt(np.mean((matrix @ solution + offset) ** 2)))
-
-
-def _slide_misfit(a: np.ndarray, b: np.ndarray, reach: float) -> float:
-    """Root mean square miss of the best line fixed in b and angle [m].
-
-    An angle counts by how far it moves the outline, which reaches so far.
-    """
-    if len(a) == 0:
-        return 0.0
-    place = np.einsum("tji,tj->ti", _rotations(b[:, 2]), a[:, :2] - b[:, :2])
-    across = np.linalg.eigvalsh(np.cov(place.T, bias=True))[0]
-    angle = a[:, 2] - b[:, 2]
-    turn = np.abs(np.mean(np.exp(1j * angle)))
-    return float(np.sqrt(max(across, 0.0) + reach**2 * 2.0 * (1.0 - turn)))
-
-
-def _rotations(angle: np.ndarray) -> np.ndarray:
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
-
-
-def _may_be_rod(spec: SceneSpec, state: np.ndarray, a: int, b: int) -> bool:
+def _may_be_rod(
+    spec: SceneSpec, state: np.ndarray, a: int, b: int, run: np.ndarray
+) -> bool:
     """Whether anchors inside reach could keep a distance.
 
     The distance of two anchors differs from that of the centres by at most both radii.
     """
-    if len(state) == 0:
-        return True
-    distance = np.hypot(*(state[:, a, :2] - state[:, b, :2]).T)
     slack = 2.0 * (spec.bodies[a].reach + spec.bodies[b].reach)
-    return bool(np.ptp(distance) < slack)
+    return rod_range(state[:, a], state[:, b], run) < slack or len(state) == 0
