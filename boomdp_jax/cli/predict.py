@@ -43,6 +43,14 @@ def _table(report: dict) -> str:
         for quantity, numbers in quantities.items():
             cells = "".join(_cell(numbers.get(name)) for name in _NUMBERS)
             lines.append(f"{horizon:>6} {quantity:<9}{cells}")
+        if not report["num_starts"][horizon]:
+            lines.append(
+                f"{horizon:>6} steps: nothing to predict from; expected rows whose "
+                "state was read in all channels of all bodies, followed by as many "
+                "rows of their run, got none"
+            )
+        elif all(each["rmse"] is None for each in quantities.values()):
+            lines.append(f"{horizon:>6} steps: nothing was read so many steps later")
     return "\n".join(lines)
 
 

@@ -241,7 +241,7 @@ def _predict_rows(
             None if impulse_scale is None else impulse_scale[draw],
             freedom,
         ).reshape(num_starts, num_draws, *places.shape, -1, 6)
-        low, high = jnp.quantile(readings, jnp.array([0.05, 0.95]), axis=1)
+        low, high = jnp.quantile(readings, _levels(num_draws), axis=1)
         return {
             "mean": readings.mean(axis=1),
             "variance": readings.var(axis=1, ddof=1),
@@ -255,6 +255,16 @@ def _predict_rows(
     return jax.tree.map(
         lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:num_rows], moments
     )
+
+
+def _levels(num_draws: int) -> Float[Array, "2"]:
+    """Between which of so many draws a further one lies with 90 %.
+
+    Between the draws of ranks k and m of n, in order, it lies with (m - k)/(n + 1); the
+    quantiles of draws themselves are nearer to each other.
+    """
+    ranks = jnp.array([0.05, 0.95]) * (num_draws + 1) - 1.0
+    return jnp.clip(ranks / (num_draws - 1), 0.0, 1.0)
 
 
 def _in_effect(

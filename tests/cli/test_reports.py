@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from boomdp_jax.cli.main import main
+from boomdp_jax.cli.predict import _table
 from boomdp_jax.physics.scene_spec import scene_spec_from_dict
 
 SCENE = {
@@ -63,6 +64,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         return {
             "schema": "boomdp-predict-1",
             "horizons": {str(h): {"position": numbers} for h in horizons},
+            "num_starts": {str(h): 4 for h in horizons},
         }
 
     stand_ins = {
@@ -145,3 +147,20 @@ def test_predict_prints_a_table_for_people(folder: Path, capsys: pytest.CaptureF
         "log_score",
     ]
     assert lines[1].split() == ["2", "position", "0.5", "-", "0.9", "-"]
+
+
+def test_predict_says_why_nothing_is_scored():
+    none = dict.fromkeys(("rmse", "baseline_rmse", "coverage90", "log_score"))
+    found = dict.fromkeys(none, 0.5)
+    report = {
+        "horizons": {
+            "1": {"position": found, "velocity": none},
+            "5": {"position": none},
+            "20": {"position": none},
+        },
+        "num_starts": {"1": 7, "5": 3, "20": 0},
+    }
+    lines = _table(report).splitlines()
+    assert [line.split()[0] for line in lines] == ["steps", *"11", *"55", "20", "20"]
+    assert lines[4].endswith("5 steps: nothing was read so many steps later")
+    assert "20 steps: nothing to predict from; expected rows whose state" in lines[6]

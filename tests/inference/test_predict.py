@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from boomdp_jax.core.history import make_history
-from boomdp_jax.inference.predict import predict, usable_starts
+from boomdp_jax.inference.predict import _levels, predict, usable_starts
 from boomdp_jax.physics import empty_params
 from tests.inference.posteriors import draws_like, make_posterior, room_spec, table_spec
 
@@ -209,3 +209,18 @@ def test_one_horizon_needs_no_list():
     expected = posterior.predict(history, {1}, num_draws=NUM_DRAWS)
     for one in (1, np.array(1), [1, 1]):
         assert posterior.predict(history, one, num_draws=NUM_DRAWS) == expected
+
+
+@pytest.mark.parametrize("num_draws", [40, 128, 1000])
+def test_nine_in_ten_further_draws_lie_between_the_levels(num_draws):
+    """Of uniform draws: the mean of what lies between them is all there is to it."""
+    draws = np.random.default_rng(num_draws).random((4000, num_draws))
+    low, high = np.quantile(draws, np.asarray(_levels(num_draws)), axis=1)
+    share = np.mean(high - low)
+    error = np.std(high - low) / np.sqrt(len(draws))
+    assert share == pytest.approx(0.9, abs=4 * error)
+
+
+def test_levels_of_few_draws_are_the_least_and_the_largest():
+    np.testing.assert_allclose(_levels(2), [0.0, 1.0])
+    np.testing.assert_allclose(_levels(10), [0.0, 1.0])
