@@ -243,13 +243,16 @@ class _Block:
         change = np.diff(self._wrench, axis=0, prepend=self._wrench[:1])
         change = change / self._dt[:, None, None]
         change[np.asarray(self._data.is_start) > 0] = 0.0
+        elapsed = np.cumsum(self._dt) - 0.5 * self._dt
+        progress = elapsed / np.sum(self._dt) - 0.5
         paths = []
         for body in range(middle.shape[1]):
             own = spread[:, body]
             both = np.column_stack([np.hypot(own[:, 3], own[:, 4]), own[:, 5]])
             place = middle[:, body]
             applied = (self._wrench[:, body], change[:, body])
-            paths.append(Path(place[:, :3], place[:, 3:], *applied, both))
+            rest = (both, progress)
+            paths.append(Path(place[:, :3], place[:, 3:], *applied, *rest))
         return paths
 
     def _by_moves(self, base: np.ndarray, scale: np.ndarray) -> np.ndarray:

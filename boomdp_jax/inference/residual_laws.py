@@ -22,6 +22,8 @@ class Path(NamedTuple):
     """Of the wrench from step to step, per second; none where a run begins."""
     spread: Float[np.ndarray, "time 2"]
     """How well velocity [m/s] and spin [rad/s] are known."""
+    progress: Float[np.ndarray, " time"]
+    """How far the recording has gone, from -1/2 to 1/2 of its length."""
 
 
 class Law(NamedTuple):
@@ -148,6 +150,16 @@ LAWS: tuple[Law, ...] = (
         "a further share of the applied torque",
         "",
         lambda p: [_torque(p.wrench[:, 2])],
+    ),
+    Law(
+        "drift",
+        "a further share of the applied force, and one of the torque, by which the end "
+        "of the recording exceeds its begin, as where its mass changes",
+        "",
+        lambda p: [
+            p.wrench * p.progress[:, None] * [1.0, 1.0, 0.0],
+            p.wrench * p.progress[:, None] * [0.0, 0.0, 1.0],
+        ],
     ),
     Law(
         "delay",

@@ -233,6 +233,18 @@ def test_commands_that_come_late_are_a_delay():
 
 
 @pytest.mark.slow
+def test_a_mass_that_grows_while_it_is_pushed_is_a_drift():
+    """Commands do a tenth more at the begin than the model says, later less."""
+    table = worlds.box_table(np.random.default_rng(12), 100)
+    state, acted, next_state = table
+    progress = (np.arange(100) + 0.5) / 100 - 0.5
+    given = acted / (1.0 - 0.2 * progress)[:, None]
+    history = make_history(state[:, None], given[:, None], next_state[:, None], DT)
+    (found,) = check([history])
+    assert_names(found, "drift", [-0.2, -0.2])
+
+
+@pytest.mark.slow
 def test_reports_say_the_law_in_words_and_numbers():
     history = worlds.record_box(np.random.default_rng(7), 100, worlds.viscous(3.0))
     (found,) = check([history])
