@@ -206,7 +206,7 @@ def lone_params(params: Params, body: int) -> Params:
                 fields[name] = jnp.full((num, 1), 0 if name == "body_a" else WORLD)
                 continue
             if empty is None:
-                pair = (2,) if name == "load_shift" else ()
+                pair = (2,) if name in ("load_shift", "stance_scale") else ()
                 empty = np.zeros((1, 1, *pair))
             empty = np.asarray(empty)
             whole = np.broadcast_to(empty, (num, *empty.shape))

@@ -164,6 +164,9 @@ def merge_params(
     fields["wheel"]["half_track"] = np.zeros((*shape, num_each["wheel"]))
     fields["ground"]["torque_share"] = np.zeros((*shape, num_each["ground"]))
     fields["ground"]["load_shift"] = np.zeros((*shape, num_each["ground"], 2))
+    fields["ground"]["stance_scale"] = np.zeros((*shape, num_each["ground"], 2))
+    for name in ("corner_share", "diagonal_share"):
+        fields["ground"][name] = np.zeros((*shape, num_each["ground"]))
     inferred = {
         kind: np.zeros(fields[kind]["active"].shape[1:], bool) for kind in fields
     }

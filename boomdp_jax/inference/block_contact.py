@@ -22,6 +22,9 @@ _OF_BODIES = (
     "feet",
     "foot_load",
     "foot_size",
+    "corner_load",
+    "diagonal",
+    "stance_axis",
     "is_static",
 )
 

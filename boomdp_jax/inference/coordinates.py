@@ -25,6 +25,8 @@ from boomdp_jax.inference.layout import Layout, SlotKey
 from boomdp_jax.inference.meeting import meeting_frame, meeting_numbers
 from boomdp_jax.inference.prior import PriorScales
 from boomdp_jax.inference.resting import rest_numbers, rest_pose
+from boomdp_jax.inference.slot_shapes import BODY_SHAPES, JOINT_SHAPES
+from boomdp_jax.inference.stance import stance_numbers
 from boomdp_jax.physics.params import (
     Distance,
     Ground,
@@ -144,45 +146,6 @@ def surroundings(
     )
 
 
-_JOINT_SHAPES: dict[str, dict[str, tuple[int, ...]]] = {
-    "revolute": {
-        "active": (),
-        "anchor_a": (2,),
-        "anchor_b": (2,),
-        "viscous": (),
-        "dry": (),
-    },
-    "distance": {"active": (), "anchor_a": (2,), "anchor_b": (2,), "length": ()},
-    "prismatic": {
-        "active": (),
-        "anchor_a": (2,),
-        "anchor_b": (2,),
-        "axis": (),
-        "angle": (),
-        "viscous": (),
-        "dry": (),
-    },
-    "weld": {"active": (), "anchor_a": (2,), "anchor_b": (2,), "angle": ()},
-}
-_BODY_SHAPES: dict[str, dict[str, tuple[int, ...]]] = {
-    "wheel": {
-        "active": (),
-        "position": (2,),
-        "heading": (),
-        "viscous": (2,),
-        "dry": (2,),
-        "half_track": (),
-    },
-    "ground": {
-        "active": (),
-        "dry": (),
-        "viscous": (),
-        "torque_share": (),
-        "load_shift": (2,),
-    },
-}
-
-
 class _Body(NamedTuple):
     """Numbers of one body that its constraints are scaled by."""
 
@@ -193,7 +156,7 @@ class _Body(NamedTuple):
 
 def _place(slot: SlotKey) -> tuple[str, int, int]:
     """Where a slot's numbers go: joints count over the block, others per body."""
-    body = slot.body_a if slot.kind in _BODY_SHAPES else 0
+    body = slot.body_a if slot.kind in BODY_SHAPES else 0
     return slot.kind, body, slot.index
 
 
@@ -355,6 +318,7 @@ class Coordinates(eqx.Module):
             numbers["load_shift"] = around.radius[a] * self._scaled(
                 "ground.load_shift", z[3:5]
             )
+            numbers |= stance_numbers(self.scales, self.scene, a, z[5:9])
         numbers = {key: jnp.where(active, value, 0.0) for key, value in numbers.items()}
         numbers["active"] = active
         return numbers
@@ -370,7 +334,7 @@ class Coordinates(eqx.Module):
             key: jnp.stack([made[kind, 0, s.index][key] for s in slots])
             if slots
             else jnp.zeros((0, *shape), bool if key == "active" else float)
-            for key, shape in _JOINT_SHAPES[kind].items()
+            for key, shape in JOINT_SHAPES[kind].items()
         }
         for key in ("body_a", "body_b"):
             values = [getattr(slot, key) for slot in slots]
@@ -382,7 +346,7 @@ class Coordinates(eqx.Module):
         num, num_bodies = self.layout.count(kind), self.layout.num_bodies
         empty = {
             key: jnp.zeros(shape, bool if key == "active" else float)
-            for key, shape in _BODY_SHAPES[kind].items()
+            for key, shape in BODY_SHAPES[kind].items()
         }
         arrays = {}
         for key, none in empty.items():

@@ -4,6 +4,7 @@ from boomdp_jax.core.history import History
 from boomdp_jax.inference.lever_doubts import lever_reasons
 from boomdp_jax.inference.posterior import Posterior, with_diagnostics
 from boomdp_jax.inference.run_breaks import run_break_reasons
+from boomdp_jax.inference.stance_doubts import stance_reasons
 from boomdp_jax.inference.still import still_notes
 from boomdp_jax.inference.unread import unread_notes
 from boomdp_jax.inference.unread_angles import angle_reasons
@@ -33,6 +34,7 @@ def with_doubts(
         *run_break_reasons(spec, history),
         *lever_reasons(spec, posterior),
         *angle_reasons(spec, history, posterior),
+        *stance_reasons(spec, posterior),
     ]
     if reasons:
         posterior = with_diagnostics(posterior, reasons)

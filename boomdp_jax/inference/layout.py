@@ -19,7 +19,7 @@ NUM_COORDINATES = {
     "prismatic": 5,
     "weld": 3,
     "wheel": 8,
-    "ground": 5,
+    "ground": 9,
 }
 """Coordinates of one constraint of each kind; see `coordinates.py` for their order."""
 

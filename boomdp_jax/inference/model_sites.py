@@ -163,9 +163,18 @@ _NUMBERS: dict[str, tuple[tuple[str, str, int, int], ...]] = {
         ("knee_speed", "ground.knee_speed", 1, 1),
         ("torque_share", "ground.torque_share", 2, 1),
         ("load_shift", "ground.load_shift", 3, 2),
+        ("stance_scale", "ground.stance_scale", 5, 2),
+        ("corner_share", "ground.corner_share", 7, 1),
+        ("diagonal_share", "ground.diagonal_share", 8, 1),
     ),
 }
-_LOGISTIC = ("wheel.viscous_ratio", "wheel.dry_ratio", "ground.torque_share")
+_LOGISTIC = (
+    "wheel.viscous_ratio",
+    "wheel.dry_ratio",
+    "ground.torque_share",
+    "ground.corner_share",
+    "ground.diagonal_share",
+)
 _WITH_TAILS = (
     "revolute.offset",
     "prismatic.offset",

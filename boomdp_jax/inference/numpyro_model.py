@@ -55,9 +55,11 @@ class ObjectModel(eqx.Module):
     `viscous_rate` [1/s], `dry_share`; `table.weld.offset` [m], `angle` [rad];
     `table.wheel.position` [m], `heading` [rad] (to be read modulo half a turn),
     `lateral_rate` [1/s], `lateral_limit`, `viscous_ratio`, `dry_ratio`, `half_track`
-    [m]; `table.ground.dry`, `knee_speed` [m/s], `torque_share`, `load_shift` [m]. A
-    joint between two bodies is `cart.revolute_to_pole`. Rates, shares, limits and
-    ratios are relative to mass and weight, as `prior.py` has them. Noise is
+    [m]; `table.ground.dry`, `knee_speed` [m/s], `torque_share`, `load_shift` [m]
+    and, where the scene gives no feet, `stance_scale` and `corner_share`, where it
+    does not give three, `diagonal_share`. A joint
+    between two bodies is `cart.revolute_to_pole`. Rates, shares, limits and ratios are
+    relative to mass and weight, as `prior.py` has them. Noise is
     `noise.position` [m], `noise.angle` [rad], `noise.velocity` [m/s], `noise.spin`
     [rad/s], one number per body, or the single `noise`.
 

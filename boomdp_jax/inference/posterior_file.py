@@ -91,7 +91,7 @@ _PAIRS = {
     "prismatic": ("anchor_a", "anchor_b", "limit", "motor"),
     "weld": ("anchor_a", "anchor_b"),
     "wheel": ("position", "viscous", "dry"),
-    "ground": ("load_shift",),
+    "ground": ("load_shift", "stance_scale"),
     "surface": (),
 }
 """Fields with two numbers in each slot."""

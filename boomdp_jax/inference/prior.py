@@ -62,6 +62,12 @@ DEFAULT_SCALES: dict[str, Scale] = {
     # Share of decoupled torque: logit-normal. Load shift in radii: normal.
     "ground.torque_share": Scale(-1.0, 1.5),
     "ground.load_shift": Scale(0.0, 0.1),
+    # How far apart feet are that the scene does not give, over an even pressure's, and
+    # the share of the load that is on the outermost (`Ground`): log- and logit-normal.
+    # Share of four legs' load on one diagonal: logit-normal.
+    "ground.stance_scale": Scale(1.0, 0.3),
+    "ground.corner_share": Scale(-1.0, 2.0),
+    "ground.diagonal_share": Scale(0.0, 0.7),
     # How far it is from the centroid (or where the scene file says it should be), in
     # units of the outline's radius of gyration: normal.
     "center_of_mass": Scale(0.0, 0.3),
@@ -93,6 +99,7 @@ LOGARITHMIC = frozenset(
         "wheel.half_track",
         "ground.friction",
         "ground.knee_speed",
+        "ground.stance_scale",
         "contact.friction",
     }
 )

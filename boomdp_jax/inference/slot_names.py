@@ -16,7 +16,15 @@ _FIELDS = {
     "prismatic": ("anchor_a", "anchor_b", "axis", "angle", "viscous", "dry"),
     "weld": ("anchor_a", "anchor_b", "angle"),
     "wheel": ("position", "heading", "viscous", "dry", "half_track"),
-    "ground": ("dry", "viscous", "torque_share", "load_shift"),
+    "ground": (
+        "dry",
+        "viscous",
+        "torque_share",
+        "load_shift",
+        "stance_scale",
+        "corner_share",
+        "diagonal_share",
+    ),
 }
 
 

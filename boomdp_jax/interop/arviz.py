@@ -19,6 +19,7 @@ _SUFFIX_DIMS = {
     "anchor_b": ("axis",),
     "position": ("axis",),
     "load_shift": ("axis",),
+    "stance_scale": ("axis",),
     "wheel_viscous": ("direction",),
     "wheel_dry": ("direction",),
 }

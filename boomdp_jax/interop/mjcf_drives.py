@@ -15,8 +15,9 @@ from boomdp_jax.interop.mjcf_elements import (
     numbers,
     velocity_force,
 )
+from boomdp_jax.physics.body_spec import BodySpec
 from boomdp_jax.physics.friction import KNEE_SPEED
-from boomdp_jax.physics.params import Params, Prismatic, Revolute
+from boomdp_jax.physics.params import Ground, Params, Prismatic, Revolute
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 
@@ -171,10 +172,10 @@ def add_ground(
     center = np.zeros(2)
     if params.center_of_mass is not None:
         center = np.asarray(params.center_of_mass[body])
-    arms = owner.feet - center
-    feet = 2.0 * center + (1.0 - share) * arms + shift
-    sizes = (1.0 - share) * owner.foot_size
-    feet, loads = _as_points(feet, sizes, owner.foot_load)
+    arms, loads, sizes = _stance(ground, at, owner)
+    square = float(loads @ (np.sum(arms**2, axis=1) + sizes**2))
+    feet = center + (1.0 - share) * arms + shift
+    feet, loads = _as_points(feet, (1.0 - share) * sizes, loads)
     name = f"{owner.name}.ground"
     for i, (place, part) in enumerate(zip(feet, loads, strict=True)):
         if part <= 0.0:
@@ -190,8 +191,7 @@ def add_ground(
                 gear=along(angle),
             )
             ET.SubElement(actuators, "general", law)
-    square = np.sum(arms**2, axis=1) + owner.foot_size**2
-    arm = share * math.sqrt(float(owner.foot_load @ square))
+    arm = share * math.sqrt(square)
     if arm > 0.0:
         ET.SubElement(element, "site", name=f"{name}.spin")
         law = velocity_force(
@@ -209,6 +209,25 @@ def add_ground(
     if np.any(owner.foot_size > 0.0):
         notes.append(f"{name}: two points stand for each foot that has a size")
     return notes
+
+
+def _stance(
+    ground: Ground, at: tuple[int, int], owner: BodySpec
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where feet are, their shares of the load, and their sizes, as `friction` does."""
+    feet, loads, sizes = owner.feet, owner.foot_load, owner.foot_size
+    if ground.corner_share is not None:
+        gone = float(ground.corner_share[at])
+        loads, sizes = loads + gone * (owner.corner_load - loads), (1.0 - gone) * sizes
+    if ground.diagonal_share is not None:
+        more = 2.0 * float(ground.diagonal_share[at]) - 1.0
+        loads = loads * (1.0 + more * owner.diagonal)
+    if ground.stance_scale is not None:
+        scale = np.asarray(ground.stance_scale[at], float)
+        cos, sin = math.cos(owner.stance_axis), math.sin(owner.stance_axis)
+        turn = np.array([[cos, -sin], [sin, cos]])
+        feet, sizes = (feet @ turn * scale) @ turn.T, sizes * math.sqrt(scale.prod())
+    return feet, loads, sizes
 
 
 def _as_points(

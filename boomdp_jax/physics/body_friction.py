@@ -20,12 +20,14 @@ from jaxtyping import Array, Float
 
 from boomdp_jax.core.one_loop import elementwise
 from boomdp_jax.physics.friction import Contact, Spin, limited
+from boomdp_jax.physics.lone_contacts import Feet, Motions, feet_sums
 from boomdp_jax.physics.many_bodies import is_many
 from boomdp_jax.physics.small_linear import dot3, inverse3, matvec3
 
 PerBody = Float[Array, "body lane"]
 
-# Points of friction that one loop takes: more make it slow to compile.
+# Points of friction in two directions that one loop takes, or three times as many feet:
+# more make it slow to compile.
 _MOST_AT_ONCE = 6
 
 
@@ -80,23 +82,59 @@ def friction_of_bodies(
         Nine entries, three, and how many contacts of each body are taken as sticking
         (`friction.limited`); None where there is no friction.
     """
-    if contacts is not None and is_many(felt.turn[0].shape[0]):
-        parts = elementwise(_friction, felt, [contacts], [], is_limited)
-        total = jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0), parts)
-        if spins is None:
-            return total
-        brake = elementwise(_friction, felt, [], _parts(spins), is_limited)
-        return jax.tree.map(jnp.add, total, brake)
-    points = [] if contacts is None else _parts(contacts)
+    wheels, feet = _told_apart(contacts)
     brakes = [] if spins is None else _parts(spins)
-    total = None
-    for first in range(0, max(len(points), 1 if brakes else 0), _MOST_AT_ONCE):
-        some = points[first : first + _MOST_AT_ONCE]
-        part = elementwise(
-            _friction, felt, some, brakes if first == 0 else [], is_limited
-        )
-        total = part if total is None else jax.tree.map(jnp.add, total, part)
+    if is_many(felt.turn[0].shape[0]):
+        total = None
+        for some in ([wheels, None], [None, feet]):
+            if some != [None, None]:
+                given = [[] if part is None else [part] for part in some]
+                parts = elementwise(_friction, felt, *given, [], is_limited)
+                parts = jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0), parts)
+                total = _added(total, parts)
+        if not brakes:
+            return total
+        return _added(total, elementwise(_friction, felt, [], [], brakes, is_limited))
+    points = [] if wheels is None else _parts(wheels)
+    stands = [] if feet is None else _parts(feet)
+    total, is_first = None, True
+    while points or stands or (brakes and is_first):
+        some, points = points[:_MOST_AT_ONCE], points[_MOST_AT_ONCE:]
+        room = 0 if points else 3 * (_MOST_AT_ONCE - len(some))
+        few, stands = stands[:room], stands[room:]
+        given = some, few, brakes if is_first else []
+        total = _added(total, elementwise(_friction, felt, *given, is_limited))
+        is_first = False
     return total
+
+
+def with_sizes_of_feet(contacts: Contact, num_feet: int) -> Contact:
+    """Tell feet, which are the last contacts, by their sizes alone (`Contact.size`).
+
+    Args:
+        contacts: `[contact, body, lane]`.
+        num_feet: how many of them are feet.
+    """
+    first = contacts.viscous[0].shape[0] - num_feet
+    size = contacts.size
+    size = jnp.zeros_like(contacts.viscous[0]) if size is None else size
+    return contacts._replace(size=size[first:] if num_feet else None)
+
+
+def _told_apart(contacts: Contact | None) -> tuple[Contact | None, Contact | None]:
+    """Wheels, and feet, which have sizes; None for none."""
+    if contacts is None:
+        return None, None
+    size, bare = contacts.size, contacts._replace(size=None)
+    num = contacts.viscous[0].shape[0] - (0 if size is None else size.shape[0])
+    wheels = jax.tree.map(lambda leaf: leaf[:num], bare) if num else None
+    if size is None:
+        return wheels, None
+    return wheels, jax.tree.map(lambda leaf: leaf[num:], bare)._replace(size=size)
+
+
+def _added(total: tuple | None, part: tuple) -> tuple:
+    return part if total is None else jax.tree.map(jnp.add, total, part)
 
 
 def answer_of_bodies(
@@ -141,7 +179,13 @@ def into_frame(frame: tuple, twist: tuple) -> tuple:
     return cos * x + sin * y, cos * y - sin * x, spin
 
 
-def _friction(felt: Felt, points: list[Contact], brakes: list[Spin], is_limited):
+def _friction(
+    felt: Felt,
+    points: list[Contact],
+    feet: list[Contact],
+    brakes: list[Spin],
+    is_limited,
+):
     """Of one body in scalars."""
     start, now, before = (
         into_frame(felt.frame, v) for v in (felt.start, felt.twist, felt.before)
@@ -157,15 +201,7 @@ def _friction(felt: Felt, points: list[Contact], brakes: list[Spin], is_limited)
             (cos * row[0] - sin * row[1], sin * row[0] + cos * row[1], row[2])
             for row in rows
         ]
-        which = (0, 1)
-        if point.size is not None:
-            # What a foot feels of its own spin turns with no heading.
-            own = (zero, zero, point.size)
-            rows, ends, which = (*rows, own), [*ends, own], (0, 1, 1)
-        viscous, knee, weight = (
-            tuple(pair[i] for i in which)
-            for pair in (point.viscous, point.knee, point.weight)
-        )
+        viscous, weight = point.viscous, point.weight
 
         def seen(twist, ends=ends, rows=rows, weight=weight):
             return tuple(
@@ -174,7 +210,7 @@ def _friction(felt: Felt, points: list[Contact], brakes: list[Spin], is_limited)
             )
 
         u = seen(now)
-        knee = tuple(k * is_limited for k in knee)
+        knee = tuple(k * is_limited for k in point.knee)
         scale, slope, back = limited(u, viscous, knee, seen(before))
         num_back = num_back + back
         for i, row in enumerate(rows):
@@ -185,6 +221,27 @@ def _friction(felt: Felt, points: list[Contact], brakes: list[Spin], is_limited)
                 for n in range(3):
                     pull = sum(k[j] * ends[j][n] for j in range(len(rows)))
                     a[m][n] = a[m][n] + row[m] * pull
+    if feet:
+        # Feet have no heading: each sees the twist in the axes of the end, whatever it
+        # is at mid-step, and what it adds turns back with the twist.
+        turned, turned_before = (into_frame(felt.turn, v) for v in (now, before))
+        motions, slope = Motions(turned, start, turned_before), [zero] * 9
+        for foot in feet:
+            patch = Feet(
+                arms=[(foot.rolling[2], foot.lateral[2])],
+                sizes=[zero if foot.size is None else foot.size],
+                viscous=[foot.viscous[0]],
+                knee=foot.knee[0] * is_limited,
+                share=foot.weight[0],
+            )
+            *entries, x, y, moment, back = feet_sums(patch, motions)
+            slope = [s + entry for s, entry in zip(slope, entries, strict=True)]
+            b = [p - q for p, q in zip(b, (x, y, moment), strict=True)]
+            num_back = num_back + back
+        for m in range(3):
+            x, y, spin = slope[3 * m : 3 * m + 3]
+            own = (cos * x - sin * y, sin * x + cos * y, spin)
+            a[m] = [p + q for p, q in zip(a[m], own, strict=True)]
     for brake in brakes:
         knee = brake.knee * is_limited
         u, old = (

@@ -17,11 +17,14 @@ from boomdp_jax.physics.scene_fields import (
     refuse,
 )
 from boomdp_jax.physics.shapes import (
+    CORNER_FEET,
     ShapeMoments,
     box_outline,
     check_outline,
     circle_moments,
+    diagonal_loads,
     foot_loads,
+    longer_axis,
     polygon_moments,
     support_feet,
 )
@@ -142,13 +145,32 @@ class BodySpec:
         """Where its feet are, and how large."""
         if self.authored_feet is not None:
             return self.authored_feet - self.shift, np.zeros(len(self.authored_feet))
-        feet, size = support_feet(self.moments)
+        feet, size = support_feet(self.moments, is_round=self.radius > 0.0)
         return feet, np.full(len(feet), size)
 
     @property
     def foot_load(self) -> Float[np.ndarray, " foot"]:
         """Share of the weight on each foot."""
         return foot_loads(self.feet)
+
+    @property
+    def corner_load(self) -> Float[np.ndarray, " foot"]:
+        """Share of the weight on each foot where only the outermost carry."""
+        load = self.foot_load
+        if self.authored_feet is None:
+            load = np.zeros(len(self.feet))
+            load[CORNER_FEET] = foot_loads(self.feet[CORNER_FEET])
+        return load
+
+    @property
+    def diagonal(self) -> Float[np.ndarray, " foot"]:
+        """What a diagonal may carry besides, over the load of each foot."""
+        return diagonal_loads(self.feet, self.corner_load)
+
+    @property
+    def stance_axis(self) -> float:
+        """Direction of the longer axis of the outline [rad]."""
+        return longer_axis(self.moments)
 
 
 def read_body(value: object, source: str, index: int) -> BodySpec:

@@ -41,7 +41,6 @@ def about_center(scene: Scene, params: Params) -> tuple[Scene, Params]:
     scene = dataclasses.replace(
         scene,
         vertices=scene.vertices - center[:, None],
-        feet=scene.feet - center[:, None],
     )
     changes: dict = {"center_of_mass": None}
     for kind in ("revolute", "distance", "prismatic", "weld"):
@@ -55,15 +54,11 @@ def about_center(scene: Scene, params: Params) -> tuple[Scene, Params]:
             anchor_a=joints.anchor_a - center[joints.body_a],
             anchor_b=joints.anchor_b - of_b,
         )
-    wheel, ground = params.wheel, params.ground
+    wheel = params.wheel
     changes["wheel"] = dataclasses.replace(
         wheel, position=wheel.position - center[:, None]
     )
-    # Loads balance about the reference point; a body stands under its centre of mass.
-    shift = jnp.broadcast_to(center[:, None], (*ground.active.shape, 2))
-    if ground.load_shift is not None:
-        shift = shift + ground.load_shift
-    changes["ground"] = dataclasses.replace(ground, load_shift=shift)
+    # A body stands under its centre of mass as its feet do about the reference point.
     return scene, dataclasses.replace(params, **changes)
 
 

@@ -241,8 +241,12 @@ def _sure_answer(problem: VelocityProblem, twist: tuple) -> BodyAnswer:
 
     contacts, spins = problem.contacts, problem.spins
     if contacts is not None:
-        arms = contacts.rolling[2], contacts.lateral[2]
-        seen = [fastest + jnp.abs(arm) * spinning for arm in arms]
+        arms = [jnp.abs(row[2]) for row in (contacts.rolling, contacts.lateral)]
+        if contacts.size is not None:
+            # Feet rub alike in every direction.
+            most = jnp.maximum(*arms)[-contacts.size.shape[0] :]
+            arms = [arm.at[-contacts.size.shape[0] :].set(most) for arm in arms]
+        seen = [fastest + arm * spinning for arm in arms]
         x, y = map(surely, contacts.viscous, contacts.knee, seen)
         contacts = contacts._replace(viscous=(x, y))
     if spins is not None:

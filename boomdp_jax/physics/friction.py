@@ -67,7 +67,8 @@ class Contact(NamedTuple):
     """Share of the end velocity in the velocity that friction sees."""
     size: PerContact | None = None
     """Third row of T: velocity per spin at which it rubs where it stands [m]. Its
-    coefficients and weight are the lateral ones."""
+    coefficients and weight are the lateral ones. A `Prepared` world has it of feet
+    alone, which are the last contacts."""
 
 
 class Spin(NamedTuple):
@@ -157,26 +158,47 @@ def _foot_points(
         """Of a foot, for each slot."""
         return jnp.tile(value.T, (num, 1))
 
-    size = scene.foot_size
-    size = jnp.zeros_like(scene.foot_load) if size is None else size
-    part = tile(scene.foot_load)
+    feet, part, size = _stance(scene, ground, each, tile)
     c, d = each(viscous) * part, each(limit) * part
     points = _Points(
-        x=(1.0 - each(share)) * tile(scene.feet[..., 0]) + each(shift[0]),
-        y=(1.0 - each(share)) * tile(scene.feet[..., 1]) + each(shift[1]),
+        x=(1.0 - each(share)) * feet[0] + each(shift[0]),
+        y=(1.0 - each(share)) * feet[1] + each(shift[1]),
         heading=jnp.zeros_like(c),
         viscous=(c, c),
         dry=(d, d),
         active=each(active),
-        size=(1.0 - each(share)) * tile(size),
+        size=(1.0 - each(share)) * size,
     )
-    square = jnp.sum(scene.feet**2, axis=-1) + size**2
-    square = jnp.sum(scene.foot_load * square, axis=-1)
+    square = part * (feet[0] ** 2 + feet[1] ** 2 + size**2)
+    square = jnp.sum(square.reshape(num, num_feet, -1), axis=1)
     arm = jnp.sqrt(jnp.where(square > 0, square, 1.0))
-    arm = share * jnp.where(square > 0, arm, 0.0)[None]
+    arm = share * jnp.where(square > 0, arm, 0.0)
     has_arm = arm > 0
     dry = jnp.where(has_arm, limit * jnp.where(has_arm, arm, 1.0), 0.0)
     return points, joint_spin(viscous * arm**2, dry, active)
+
+
+def _stance(scene: Scene, ground: Ground, each, tile) -> tuple[tuple, Array, Array]:
+    """Place of every foot, its share of the load, and its size."""
+    feet, part = (tile(scene.feet[..., 0]), tile(scene.feet[..., 1])), scene.foot_load
+    size = jnp.zeros_like(part) if scene.foot_size is None else scene.foot_size
+    corner = part if scene.corner_load is None else scene.corner_load
+    part, size, corner = tile(part), tile(size), tile(corner)
+    if ground.corner_share is not None:
+        gone = each(ground.corner_share.T)
+        part, size = part + gone * (corner - part), (1.0 - gone) * size
+    if ground.diagonal_share is not None and scene.diagonal is not None:
+        more = 2.0 * each(ground.diagonal_share.T) - 1.0
+        part = part * (1.0 + more * tile(scene.diagonal))
+    if ground.stance_scale is not None:
+        along, across = (each(ground.stance_scale[..., i].T) for i in range(2))
+        size = jnp.sqrt(along * across) * size
+        axis = scene.stance_axis
+        sin, cos = (0.0, 1.0) if axis is None else sincos(axis[None])
+        u = along * (cos * feet[0] + sin * feet[1])
+        v = across * (cos * feet[1] - sin * feet[0])
+        feet = (cos * u - sin * v, sin * u + cos * v)
+    return feet, part, size
 
 
 def friction_points(

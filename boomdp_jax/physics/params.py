@@ -109,6 +109,15 @@ class Ground(eqx.Module):
     """Share of the friction torque that does not depend on sliding, in [0, 1]."""
     load_shift: Float[Array, "*batch body ground 2"] | None = None
     """Offset of the centre of load from the feet's own, body frame [m]."""
+    stance_scale: Float[Array, "*batch body ground 2"] | None = None
+    """How far apart the feet are, over the scene's, along and across the longer axis
+    of the outline (`Scene.stance_axis`), and how large; None: one."""
+    corner_share: Float[Array, "*batch body ground"] | None = None
+    """Share of the load that has gone from all feet to the outermost, in [0, 1]
+    (`Scene.corner_load`), the others having shrunk as well; None: zero."""
+    diagonal_share: Float[Array, "*batch body ground"] | None = None
+    """Share of the load of four legs on one diagonal, in [0, 1], by
+    `Scene.diagonal`, as legs that are not equally long have it; None: a half."""
 
 
 class Surface(eqx.Module):

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from boomdp_jax.core.arrays import FloatScalar
 from boomdp_jax.core.holding import hold, runtime_one
 from boomdp_jax.core.written_out import one_loop_of_arrays
+from boomdp_jax.physics.body_friction import with_sizes_of_feet
 from boomdp_jax.physics.friction import (
     KNEE_SPEED,
     Contact,
@@ -186,6 +187,9 @@ def prepare_world(
 
     bodies = jax.vmap(of_one, in_axes=-1, out_axes=-1)(scene, params, length)
     length = bodies.length
+    if bodies.contacts is not None:
+        num_feet = params.ground.active.shape[-2] * scene.feet.shape[-3]
+        bodies = bodies._replace(contacts=with_sizes_of_feet(bodies.contacts, num_feet))
     if scene.area.shape[0] == 1:
         bodies = jax.tree.map(lambda leaf: leaf[..., None, :], bodies)
         bodies = bodies._replace(length=length)

@@ -37,6 +37,16 @@ class Scene(eqx.Module):
     foot_size: Float[Array, "*batch body foot"] | None = None
     """Lever of a foot's friction against its own spin, zero for a point [m]: it rubs at
     the speed sqrt(v² + size² spin²). None: all are points."""
+    corner_load: Float[Array, "*batch body foot"] | None = None
+    """Share of the weight on each foot where only the outermost carry: `foot_load` of
+    feet that a scene gives, what stands on legs at its corners otherwise
+    (`Ground.corner_share`). None: `foot_load`."""
+    diagonal: Float[Array, "*batch body foot"] | None = None
+    """What is more on each foot, over its load, where as much as possible is on one
+    diagonal, which leaves the centre of the load where it is; zero for three feet
+    (`Ground.diagonal_share`). None: all zero."""
+    stance_axis: Float[Array, "*batch body"] | None = None
+    """Direction of the longer axis of the outline, body frame [rad]; None: zero."""
     smoothing: Float[Array, "*batch"] | None = None
     """Speed s by which contact is smoothed [m/s]; None: not at all. Bodies then push
     each other before they touch, at a gap d with an acceleration of s²/d, and friction

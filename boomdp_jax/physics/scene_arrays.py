@@ -63,6 +63,8 @@ def build_scene(
     vertices = [_pad_with_last(body.vertices, num_vertices) for body in bodies]
     feet = [_pad_with_last(body.feet, num_feet) for body in bodies]
     loads = [_pad_with_zeros(body.foot_load, num_feet) for body in bodies]
+    corners = [_pad_with_zeros(body.corner_load, num_feet) for body in bodies]
+    diagonals = [_pad_with_zeros(body.diagonal, num_feet) for body in bodies]
     sizes = [_pad_with_zeros(body.foot_size, num_feet) for body in bodies]
     # Concrete arrays even under a trace: the caller keeps them.
     with jax.ensure_compile_time_eval():
@@ -75,6 +77,9 @@ def build_scene(
             feet=on_device(np.stack(feet)),
             foot_load=on_device(np.stack(loads)),
             foot_size=on_device(np.stack(sizes)),
+            corner_load=on_device(np.stack(corners)),
+            diagonal=on_device(np.stack(diagonals)),
+            stance_axis=on_device([body.stance_axis for body in bodies]),
             is_static=on_device([body.is_static for body in bodies], bool),
             gravity=on_device(gravity),
             normal_gravity=on_device(normal_gravity),

@@ -140,24 +140,33 @@ def check_outline(vertices: Float[np.ndarray, "vertex 2"]) -> None:
 
 _FEET_ABREAST = 3
 """Feet along each principal axis."""
+_RING = 0.681
+"""Radius of the ring over that of the disc, which is 3/2 of its reach: the one that is
+nearest to the friction of slow motions of all ratios of spin to speed (1.2 % off, root
+mean square; three by three feet 1.6 %)."""
+CORNER_FEET = np.array([0, 2, 6, 8])
+"""Which of `support_feet` are the outermost ones."""
 _FOOT_PLACE = 0.95
 """Where they stand, over the middles of equal parts of a box of the same moments."""
 
 
-def support_feet(moments: ShapeMoments) -> tuple[Float[np.ndarray, "9 2"], float]:
+def support_feet(
+    moments: ShapeMoments, *, is_round: bool = False
+) -> tuple[Float[np.ndarray, "9 2"], float]:
     """Nine feet that rub almost as the whole area does under an even pressure.
 
-    They stand about the middles of three by three equal parts of the outline, and are
-    so large that under equal loads the friction torque of a pure spin is that of the
-    whole area. Friction of slow motions, of all ratios of spin to speed, is then 1 to
-    2 % off for discs and boxes of up to 2 to 1, root mean square, and 3 % for triangles
-    and boxes of 4 to 1. (Six feet: 2 to 4 %. Four: 3 to 6 %. Four points with the
-    moments of the outline: 10 to 16 %. Of sixteen discs and boxes under an even
-    pressure, pushed until they slip, twelve had a wheel for certain by those points,
-    none by nine feet.) Used where a body gives no feet.
+    They stand about the middles of three by three equal parts of the outline, in a disc
+    in a ring and in its middle, and are so large that under equal loads the friction
+    torque of a pure spin is that of the whole area. Friction of slow motions, of all
+    ratios of spin to speed, is then 1 to 2 % off for discs and boxes of up to 2 to 1,
+    root mean square, and 3 % for triangles and boxes of 4 to 1. (Six feet: 2 to 4 %.
+    Four: 3 to 6 %. Four points with the moments of the outline: 10 to 16 %. Of sixteen
+    discs and boxes under an even pressure, pushed until they slip, twelve had a wheel
+    for certain by those points, none by nine feet.) Used where a body gives no feet.
 
     Args:
         moments: moments of the outline.
+        is_round: whether it is a disc.
 
     Returns:
         The feet about the centre of mass, along the outline's axes, and the size of
@@ -168,6 +177,9 @@ def support_feet(moments: ShapeMoments) -> tuple[Float[np.ndarray, "9 2"], float
     middles = (2.0 * np.arange(_FEET_ABREAST) + 1.0) / _FEET_ABREAST - 1.0
     grid = np.stack(np.meshgrid(middles, middles), axis=-1).reshape(-1, 2)
     feet = _FOOT_PLACE * grid * half
+    if is_round:
+        far = np.hypot(*grid.T)
+        feet = _RING * 1.5 * moments.reach * grid / np.maximum(far, 1e-9)[:, None]
     square = np.sum(feet**2, axis=1)
     # What they are too short of, by bisection: the mean grows with the size.
     least, most = 0.0, moments.reach
@@ -203,6 +215,53 @@ def foot_loads(feet: Float[np.ndarray, "foot 2"]) -> Float[np.ndarray, " foot"]:
             return np.maximum(load, 0.0) / np.sum(np.maximum(load, 0.0))
         carries[np.argmin(load)] = False
     return np.full(num_feet, 1.0 / num_feet)
+
+
+def diagonal_loads(
+    feet: Float[np.ndarray, "foot 2"], load: Float[np.ndarray, " foot"]
+) -> Float[np.ndarray, " foot"]:
+    r"""How loads may change as those of a table do that rocks on its four legs.
+
+    Of all changes that leave the sum of the loads and their centre as they are, the one
+    nearest to one that goes as the product of the coordinates along the feet's own
+    axes; four legs have no other.
+
+    Args:
+        feet: feet relative to the centre of mass [m].
+        load: shares of the weight on them.
+
+    Returns:
+        The change over the load, at most one in size; all zero where there is none.
+    """
+    carries = load > 1e-9
+    places = feet[carries] - load @ feet
+    none = np.zeros(len(feet))
+    if len(places) < 4:
+        return none
+    reach = np.max(np.abs(places))
+    rows = np.concatenate([np.ones((len(places), 1)), places / reach], axis=1).T
+    _, axes = np.linalg.eigh(places.T @ (load[carries, None] * places))
+    along = places @ axes
+    wanted = load[carries] * along[:, 0] * along[:, 1] / reach**2
+    if len(places) == 4:
+        wanted = np.linalg.svd(rows)[2][-1]
+    change = wanted - np.linalg.pinv(rows) @ (rows @ wanted)
+    if not np.max(np.abs(change)) > 1e-6 * np.max(load):
+        return none
+    none[carries] = change / load[carries]
+    return none / none[np.argmax(np.abs(none))]
+
+
+def longer_axis(moments: ShapeMoments) -> float:
+    """Direction of the longer principal axis of an outline [rad].
+
+    Args:
+        moments: moments of the outline.
+    """
+    (xx, xy), (_, yy) = moments.covariance
+    if np.hypot(xx - yy, 2.0 * xy) < 1e-9 * (xx + yy):
+        return 0.0
+    return 0.5 * float(np.arctan2(2.0 * xy, xx - yy))
 
 
 def _weighted_outer(

@@ -11,19 +11,22 @@ from boomdp_jax.inference.fit_search import search_further
 from boomdp_jax.inference.fit_starts import Guesses
 from tests.inference.prior_objects import draw_tracks
 
+NUM = 8
+"""Objects."""
+
 
 @pytest.fixture(scope="module")
 def few():
-    """Four objects, and a fit of every structure of each: with nothing known."""
-    targets = draw_tracks(np.random.default_rng(4), 4, 20).targets
+    """Eight objects, and a fit of every structure of each: with nothing known."""
+    targets = draw_tracks(np.random.default_rng(4), NUM, 20).targets
     num = targets.structures.shape[1]
-    index, structure = np.repeat(np.arange(4), num), np.tile(np.arange(num), 4)
+    index, structure = np.repeat(np.arange(NUM), num), np.tile(np.arange(num), NUM)
     z = np.zeros((len(index), targets.slot.shape[-1]))
     return targets, make_fits(targets, index, structure, z)
 
 
 def search(targets, fits, num_searches: int):
-    rng, lack = np.random.default_rng(0), np.full(4, 1e6)
+    rng, lack = np.random.default_rng(0), np.full(NUM, 1e6)
     settings = FitSettings(num_searches=num_searches)
     return search_further(rng, targets, Guesses.of(targets), fits, settings, lack)
 
@@ -32,7 +35,7 @@ def test_copies_of_one_climb_do_not_agree(few):
     targets, fits = few
     found = search(targets, join_fits(fits, fits, fits), 1)
     new = found.take(np.arange(3 * len(fits.value), len(found.value)))
-    assert set(new.index.tolist()) == {0, 1, 2, 3}
+    assert set(new.index.tolist()) == set(range(NUM))
 
 
 def test_where_climbs_from_anywhere_agree_there_are_no_more(few):
@@ -43,13 +46,13 @@ def test_where_climbs_from_anywhere_agree_there_are_no_more(few):
     # Of sixteen of a structure the first eight are from anywhere.
     is_anywhere = is_new & ((np.arange(len(one.value)) - len(fits.value)) % 16 < 8)
     group = one.index * num_structures + one.structure
-    is_done = np.zeros(4, bool)
-    for i in range(4):
+    is_done = np.zeros(NUM, bool)
+    for i in range(NUM):
         own = np.flatnonzero(one.index == i)
         top = own[np.argmax(one.value[own])]
         same = is_anywhere & (group == group[top])
         is_done[i] = np.sum(one.value[same] > one.value[top] - 2.0) >= 3
-    assert 0 < np.sum(is_done) < 4, "draw other objects"
+    assert 0 < np.sum(is_done) < NUM, "draw other objects"
     few_climbs, many_climbs = (np.bincount(f.index) for f in (one, three))
     np.testing.assert_array_equal(many_climbs == few_climbs, is_done)
 
@@ -59,8 +62,8 @@ def test_where_they_do_not_the_best_structures_are_climbed_again(few):
     found = search(targets, fits, 1)
     new = found.take(np.arange(len(fits.value), len(found.value)))
     num_structures = targets.structures.shape[1]
-    value = fits.value.reshape(4, num_structures)
-    for i in range(4):
+    value = fits.value.reshape(NUM, num_structures)
+    for i in range(NUM):
         best = set(np.argsort(-value[i])[:3].tolist())
         assert set(new.structure[new.index == i].tolist()) == best
         before = value[i].max()

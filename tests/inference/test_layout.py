@@ -76,7 +76,7 @@ def test_coordinates_of_slots_do_not_overlap():
     assert slot.shape == (layout.dim,)
     assert list(np.flatnonzero(slot < 0)) == [0, 1]
     counts = np.bincount(slot[2:])
-    sizes = {"revolute": 6, "distance": 5, "wheel": 8, "ground": 5}
+    sizes = {"revolute": 6, "distance": 5, "wheel": 8, "ground": 9}
     assert counts.tolist() == [sizes[s.kind] for s in layout.slots]
     assert np.count_nonzero(layout.period()) == 4
 

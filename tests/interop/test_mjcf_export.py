@@ -284,6 +284,9 @@ def test_law_shapes_of_wheel_and_floor_are_carried():
             params.ground,
             torque_share=jnp.full((1, 1), 0.4),
             load_shift=jnp.asarray([[[0.05, 0.02]]]),
+            stance_scale=jnp.asarray([[[1.3, 0.8]]]),
+            corner_share=jnp.full((1, 1), 0.7),
+            diagonal_share=jnp.full((1, 1), 0.3),
         ),
         center_of_mass=jnp.asarray([[0.04, 0.03]]),
     )

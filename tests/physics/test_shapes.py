@@ -9,6 +9,7 @@ from boomdp_jax.physics.shapes import (
     check_outline,
     circle_moments,
     foot_loads,
+    longer_axis,
     polygon_moments,
     support_feet,
 )
@@ -111,7 +112,7 @@ def test_reach_of_a_square_and_of_a_disc_is_that_of_the_tables():
 
 
 OUTLINES = {
-    "disc": (_regular(360), 0.025),
+    "disc": (_regular(360), 0.015),
     "square": (box_outline(np.array([0.2, 0.2])), 0.025),
     "box": (box_outline(np.array([0.6, 0.3])), 0.025),
     "plank": (box_outline(np.array([1.0, 0.1])), 0.06),
@@ -125,7 +126,7 @@ def test_feet_of_an_outline_rub_as_all_of_it_does(name: str):
     corners, most = OUTLINES[name]
     moments = polygon_moments(corners)
     points = inside(corners) - moments.centroid
-    feet, size = support_feet(moments)
+    feet, size = support_feet(moments, is_round=name == "disc")
     np.testing.assert_allclose(np.mean(feet, axis=0), 0.0, atol=1e-12)
     rng = np.random.default_rng(0)
     misses = []
@@ -214,3 +215,14 @@ def test_convex_outlines_pass(vertices: np.ndarray):
 def test_other_outlines_are_refused(vertices: list, message: str):
     with pytest.raises(ValueError, match=message):
         check_outline(np.asarray(vertices, float))
+
+
+def test_the_longer_axis_of_a_turned_box_is_its_turn():
+    for turn in (0.0, 0.7, -1.2):
+        cos, sin = np.cos(turn), np.sin(turn)
+        corners = box_outline(np.array([0.6, 0.3])) @ np.array(
+            [[cos, sin], [-sin, cos]]
+        )
+        assert longer_axis(polygon_moments(corners)) == pytest.approx(turn, abs=1e-9)
+    assert longer_axis(circle_moments(0.3)) == 0.0
+    assert longer_axis(polygon_moments(box_outline(np.array([0.2, 0.2])))) == 0.0
