@@ -88,8 +88,8 @@ class OnlineBelief:
 
     With `forgetting` $\lambda < 1$ the likelihood of a row that is n rows old counts to
     the power $\lambda^n$: the belief rests on the last $1 / (1 - \lambda)$ rows or so,
-    and drifts back to the prior where nothing new is learnt. (The prior itself is not
-    forgotten.)
+    and drifts back to the prior, which is not forgotten, where nothing new is learnt.
+    It is late by what changes within those rows, and intervals do not allow for that.
     """
 
     def __init__(

@@ -10,8 +10,10 @@ from boomdp_jax.inference.online_window import windowed
 from boomdp_jax.inference.residual import ResidualCheck, check_residuals
 from boomdp_jax.inference.sample import BlockDraws
 
-# Rows that count less than this by forgetting may be of another object.
-_LEAST_WEIGHT = math.exp(-1.0)
+# Rows that count less than this by forgetting may be of another object. Those that
+# count for little are asked as well: of a slow change recent ones alone show nothing,
+# and a belief that follows it is late by more than it says.
+_LEAST_WEIGHT = math.exp(-3.0)
 
 
 def _first_row(belief: BlockBelief, num_rows: int, forgetting: float) -> int:

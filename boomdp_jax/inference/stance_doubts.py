@@ -6,7 +6,7 @@ from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 # Probability of both at once from which it matters.
-_LEAST = 0.1
+_LEAST = 0.5
 
 
 def stance_reasons(spec: SceneSpec, posterior: Posterior) -> list[str]:
