@@ -119,9 +119,31 @@ class _OneLineParser(argparse.ArgumentParser):
         self.exit(2)
 
 
+class _Versions(argparse.Action):
+    """Prints versions and stops; libraries are asked for only then."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        option_string: str | None = None,
+    ) -> None:
+        versions = importlib.import_module("boomdp_jax.core.versions")
+        found = versions.library_versions().items()
+        print(", ".join(f"{name} {version}" for name, version in found))
+        parser.exit()
+
+
 def _make_parser() -> argparse.ArgumentParser:
     parser = _OneLineParser(
         prog="boomdp_jax", description="Learn what a pushed object is, and use it."
+    )
+    parser.add_argument(
+        "--version",
+        action=_Versions,
+        nargs=0,
+        help="of this and of what it computes with",
     )
     commands = parser.add_subparsers(dest="command", required=True)
     _add_infer(commands.add_parser("infer", help="from recordings to a posterior"))

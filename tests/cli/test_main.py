@@ -1,5 +1,6 @@
 """The command line as a whole: arguments, exit status, one line on bad input."""
 
+import importlib.metadata
 import os
 import subprocess
 import sys
@@ -173,6 +174,13 @@ def test_methods_are_those_of_the_library():
 def test_help_is_status_0(capsys: pytest.CaptureFixture):
     assert main(["infer", "--help"]) == 0
     assert "--scene" in capsys.readouterr().out
+
+
+def test_versions_are_told(capsys: pytest.CaptureFixture):
+    assert main(["--version"]) == 0
+    told = capsys.readouterr().out.strip()
+    assert told.startswith(f"boomdp_jax {boomdp_jax.__version__}, jax ")
+    assert f"numpyro {importlib.metadata.version('numpyro')}" in told
 
 
 def test_the_module_runs_as_a_program(folder: Path):
