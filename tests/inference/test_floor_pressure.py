@@ -1,13 +1,13 @@
 """What presses on the floor with all of its area has no wheel."""
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from boomdp_jax.inference import infer, infer_batch
+from boomdp_jax.inference import infer_batch
 from boomdp_jax.inference.stance_doubts import stance_reasons
+from boomdp_jax.physics import empty_params
+from tests.inference.posteriors import draws_like, make_posterior, table_spec
 from tests.inference.standing_objects import pushed_object
 
 NUM_OBJECTS = 6
@@ -36,26 +36,17 @@ def test_discs_and_boxes_that_slip_every_way_have_friction_and_no_wheel(stance):
 
 
 def test_a_wheel_beside_friction_is_doubted_where_nobody_gave_the_feet():
-    spec, history, _ = pushed_object([11, 1], "four legs")
-    told, *_ = pushed_object([11, 1], "four legs, told")
-    found = infer(jax.random.key(0), spec, history, method="laplace")
+    spec, told = table_spec(), table_spec(feet=[[0.1, 0.1], [-0.1, 0.1], [0.0, -0.1]])
+    empty = empty_params(1, num_revolute=1, num_wheel=1, num_ground=1)
 
-    def with_slots(wheel: bool, ground: bool):
-        params = found.params
-        return eqx.tree_at(
-            lambda p: (p.params.wheel.active, p.params.ground.active),
-            found,
-            (
-                jnp.full_like(params.wheel.active, wheel),
-                jnp.full_like(params.ground.active, ground),
-            ),
-        )
+    def reasons(spec, wheel, ground):
+        params = draws_like(empty, 10, wheel_active=wheel, ground_active=ground)
+        return stance_reasons(spec, make_posterior(spec, params, params))
 
-    both = with_slots(True, True)
-    (reason,) = stance_reasons(spec, both)
-    assert reason.startswith("object: has a wheel beside friction with the floor")
+    (reason,) = reasons(spec, True, True)
+    assert reason.startswith("table: has a wheel beside friction with the floor")
     assert "probability 1.00" in reason
     assert "expected 'feet' in the scene, got none" in reason
-    assert stance_reasons(told, both) == []
-    assert stance_reasons(spec, with_slots(True, False)) == []
-    assert stance_reasons(spec, with_slots(False, True)) == []
+    assert reasons(told, True, True) == []
+    assert reasons(spec, True, False) == []
+    assert reasons(spec, False, True) == []
