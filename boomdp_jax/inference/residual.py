@@ -243,8 +243,8 @@ class _Block:
         change = np.diff(self._wrench, axis=0, prepend=self._wrench[:1])
         change = change / self._dt[:, None, None]
         change[np.asarray(self._data.is_start) > 0] = 0.0
-        elapsed = np.cumsum(self._dt) - 0.5 * self._dt
-        progress = elapsed / np.sum(self._dt) - 0.5
+        length = np.where(np.asarray(self._data.is_used) > 0, self._dt, 0.0)
+        progress = (np.cumsum(length) - 0.5 * length) / np.sum(length) - 0.5
         paths = []
         for body in range(middle.shape[1]):
             own = spread[:, body]
