@@ -14,6 +14,7 @@ from boomdp_jax.inference.block import Block, make_block
 from boomdp_jax.inference.components import independent_blocks
 from boomdp_jax.inference.layout import Layout, SlotKey, block_layout
 from boomdp_jax.inference.redundancy import NEW_KINDS, Tie, is_redundant
+from boomdp_jax.inference.slot_shapes import JOINT_SHAPES
 from boomdp_jax.inference.touching import find_touching
 from boomdp_jax.physics.constraint_spec import JOINTS, KINDS, ConstraintSpec
 from boomdp_jax.physics.params import WORLD
@@ -25,17 +26,10 @@ another body is a pair, `{"cart": [("revolute", "pole")]}`."""
 
 # Numbers of each kind, as a scene file with nulls would have them.
 _NUMBERS: dict[str, dict[str, tuple[int, ...]]] = {
-    "revolute": {"anchor_a": (2,), "anchor_b": (2,), "viscous": (), "dry": ()},
-    "distance": {"anchor_a": (2,), "anchor_b": (2,), "length": ()},
-    "prismatic": {
-        "anchor_a": (2,),
-        "anchor_b": (2,),
-        "axis": (),
-        "angle": (),
-        "viscous": (),
-        "dry": (),
+    **{
+        kind: {name: shape for name, shape in shapes.items() if name != "active"}
+        for kind, shapes in JOINT_SHAPES.items()
     },
-    "weld": {"anchor_a": (2,), "anchor_b": (2,), "angle": ()},
     "wheel": {"position": (2,), "heading": (), "viscous": (2,), "dry": (2,)},
     "ground": {"viscous": (), "dry": ()},
 }

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 # Readings of which a running median is made, at most, and windows that a run has at
 # least: bursts of half as many vanish, and what moves for longer than that stays.
@@ -126,7 +127,9 @@ def _robust(
     for _ in range(_NUM_REWEIGHTED):
         size = np.linalg.norm(found, axis=1)
         least = max(1e-3 * float(np.median(size)), 1e-9)
-        found = missed(1.0 / np.maximum(size, least))
+        before, found = found, missed(1.0 / np.maximum(size, least))
+        if np.max(np.abs(found - before)) < least:
+            break
     return found
 
 
@@ -154,11 +157,9 @@ def _running_median(
         half = min(_WINDOW, len(rows) // _LEAST_WINDOWS) // 2
         if half == 0:
             continue
-        for place in range(len(rows)):
-            # At the ends the window moves in as a whole.
-            begin = min(max(place - half, 0), len(rows) - 2 * half - 1)
-            out[rows[place]] = np.median(
-                values[rows[begin : begin + 2 * half + 1]], axis=0
-            )
+        windows = sliding_window_view(values[rows], 2 * half + 1, axis=0)
+        # At the ends the window moves in as a whole.
+        begin = np.clip(np.arange(len(rows)) - half, 0, len(windows) - 1)
+        out[rows] = np.median(windows, axis=-1)[begin]
         is_smooth[rows] = True
     return out, is_smooth

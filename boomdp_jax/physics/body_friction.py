@@ -86,12 +86,11 @@ def friction_of_bodies(
     brakes = [] if spins is None else _parts(spins)
     if is_many(felt.turn[0].shape[0]):
         total = None
-        for some in ([wheels, None], [None, feet]):
-            if some != [None, None]:
-                given = [[] if part is None else [part] for part in some]
-                parts = elementwise(_friction, felt, *given, [], is_limited)
-                parts = jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0), parts)
-                total = _added(total, parts)
+        for part, given in ((wheels, ([wheels], [])), (feet, ([], [feet]))):
+            if part is not None:
+                each = elementwise(_friction, felt, *given, [], is_limited)
+                each = jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0), each)
+                total = _added(total, each)
         if not brakes:
             return total
         return _added(total, elementwise(_friction, felt, [], [], brakes, is_limited))
