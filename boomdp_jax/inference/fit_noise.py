@@ -92,7 +92,9 @@ def climb_noise(
         choice = np.argmax(found, axis=1)
         each = np.arange(len(left))
         is_better = found[each, choice] > here
-        gain = np.where(is_better, found[each, choice] - here, 0.0)
+        # Both may be minus infinity.
+        gain = np.zeros(len(left))
+        np.subtract(found[each, choice], here, out=gain, where=is_better)
         x[left] = np.where(is_better[:, None], tries[each, choice], x[left])
         left = left[gain > _ARRIVED]
         if not left.size:
