@@ -1,4 +1,4 @@
-"""First guesses from the readings: where pins, axles, drawers would have to be."""
+"""First guesses from the readings: where pins, rods, axles would have to be."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -7,8 +7,9 @@ from jaxtyping import Array, Bool, Float
 from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.inference.coordinates import Coordinates
 from boomdp_jax.inference.layout import BODY_NUMBERS, SlotKey
-from boomdp_jax.inference.meeting import anchor_scale, met_at
+from boomdp_jax.inference.meeting import anchor_scale, met_at, rod_length
 from boomdp_jax.inference.one_step import Readings
+from boomdp_jax.inference.rod_guess import rod_guess
 from boomdp_jax.physics.params import WORLD
 
 # Distances [m] and speeds [m/s] that weigh the same in a guess: what a camera resolves.
@@ -113,6 +114,9 @@ def seed_coordinates(
         if slot.kind == "revolute":
             values = _pin_seed(coordinates, data, slot, reach)
             where = slice(slot.start, slot.start + 4)
+        elif slot.kind == "distance":
+            values = _rod_seed(coordinates, data, slot, reach)
+            where = slice(slot.start, slot.start + 5)
         elif slot.kind == "wheel":
             values = _wheel_seed(coordinates, data, slot)
             where = slice(slot.start, slot.start + 3)
@@ -141,6 +145,25 @@ def _pin_seed(coordinates: Coordinates, data: Readings, slot: SlotKey, reach):
         [
             scales.standard("revolute.anchor", (first - middle) / unit),
             jnp.arcsinh(scales.standard("revolute.offset", off)),
+        ]
+    )
+
+
+def _rod_seed(coordinates: Coordinates, data: Readings, slot: SlotKey, reach):
+    around, scales, a = coordinates.surroundings, coordinates.scales, slot.body_a
+    origin, other = around.center[a], reach[a]
+    if slot.body_b != WORLD:
+        origin, other = jnp.zeros(2), reach[slot.body_b]
+    unit = jnp.stack([reach[a], other])
+    noise = _POSITION_NOISE, _VELOCITY_NOISE
+    first, second, length = rod_guess(data, a, slot.body_b, unit, origin, noise)
+    frame = around.meeting[coordinates.layout.meetings.index(slot)]
+    met = rod_length(frame, first, second, around.radius[a])
+    return jnp.concatenate(
+        [
+            scales.standard("distance.anchor", first / reach[a]),
+            scales.standard("distance.anchor", (second - origin) / other),
+            scales.standard("distance.length", jnp.log(length / met))[None],
         ]
     )
 
