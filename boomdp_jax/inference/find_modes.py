@@ -26,6 +26,7 @@ from boomdp_jax.inference.fit import (
 from boomdp_jax.inference.fit_noise import NoisePeaks, fit_noise, with_gains
 from boomdp_jax.inference.fit_search import search_further
 from boomdp_jax.inference.fit_starts import Guesses, first_fits, grown_fits
+from boomdp_jax.inference.floor_starts import with_other_floors
 from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.noise_level import NUM_EACH, NoiseFit
 from boomdp_jax.inference.read_velocities import with_read_velocities
@@ -94,6 +95,7 @@ def find_modes(
         if number > 0:
             # Gains have changed a little, and what there is to find has been found.
             fits = climb(targets, again, settings.num_repeats, lack)
+            fits = with_other_floors(targets, fits)
             continue
         fits = _climbed(rng, targets, guesses, again, settings, lack)
     modes = collect_modes(targets, fits, settings.num_modes, lack)
@@ -185,7 +187,8 @@ def _climbed(
     num = settings.num_iterations
     fits = climb(targets, starts, num, lack, from_anywhere=from_anywhere)
     grown = grown_fits(rng, targets, guesses, fits, settings, lack)
-    return join_fits(fits, climb(targets, grown, num, lack))
+    fits = join_fits(fits, climb(targets, grown, num, lack))
+    return with_other_floors(targets, fits)
 
 
 def _first_noise(targets: StructureTarget, top: Fits) -> NoiseFit:
