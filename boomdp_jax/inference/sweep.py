@@ -284,8 +284,8 @@ class Sweep:
         """
         path = self.folder / _MANIFEST
         now = json.loads(json.dumps(self.manifest()))
-        # Folders of before there was a choice do not name it.
-        begun = {"outliers": "none"} | read_json(path, SCHEMA)
+        # Folders of before there was a choice do not name it, nor older ones scenes.
+        begun = {"outliers": "none", "scenes": now["scenes"]} | read_json(path, SCHEMA)
         check_same(path, begun, now)
 
     def check_untouched(self, units: Sequence[int]) -> None:
@@ -348,6 +348,7 @@ class Sweep:
             "num_objects": len(self.histories),
             "batch": self.batch,
             "num_rows": self.num_rows,
+            "scenes": _hash(*map(_scene_bytes, self.specs)),
             **self.options,
             "float": str(jax.dtypes.canonicalize_dtype(float)),
             "platform": jax.default_backend(),
@@ -367,7 +368,7 @@ class Sweep:
     def _input_hash(self, number: int) -> str:
         """Of a recording and its scene."""
         source = self.histories[number]
-        scene = json.dumps(self.specs[number].to_dict(), sort_keys=True).encode()
+        scene = _scene_bytes(self.specs[number])
         if not isinstance(source, History):
             return _hash(scene, Path(source).read_bytes())
         leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(source)]
@@ -381,6 +382,10 @@ def roomy(num_rows: int) -> int:
     while 2 * power <= num_rows:
         power *= 2
     return next(n for n in (power, power * 3 // 2, 2 * power) if n >= num_rows)
+
+
+def _scene_bytes(spec: SceneSpec) -> bytes:
+    return json.dumps(spec.to_dict(), sort_keys=True).encode()
 
 
 def _hash(*parts: bytes) -> str:

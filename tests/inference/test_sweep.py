@@ -27,6 +27,7 @@ from boomdp_jax.inference.sweep_arguments import (
     listed,
     structure_for_file,
 )
+from boomdp_jax.physics.scene_spec import scene_spec_from_dict
 from tests.inference.posteriors import table_posterior, table_spec
 from tests.inference.recordings import box_scene, free_box
 from tests.inference.sweep_program import NUM_OBJECTS
@@ -196,10 +197,21 @@ def test_a_folder_of_before_outliers_had_a_choice_goes_on(tmp_path: Path):
     begin(tmp_path)
     manifest = json.loads((tmp_path / "sweep.json").read_text())
     assert manifest.pop("outliers") == "none"
+    # Nor did scenes.
+    assert manifest.pop("scenes")
     (tmp_path / "sweep.json").write_text(json.dumps(manifest))
     begin(tmp_path)
     with pytest.raises(ValueError, match=r'outliers: expected "none", .*"student-t"'):
         begin(tmp_path, outliers="student-t")
+
+
+def test_a_shard_with_another_scene_is_refused(tmp_path: Path):
+    begin(tmp_path)
+    given = table_spec().to_dict()
+    given["bodies"][0]["density"] = 1.0
+    other = scene_spec_from_dict(given)
+    with pytest.raises(ValueError, match=r"sweep\.json: scenes: expected .* choose"):
+        begin_sweep(jax.random.key(KEY), other, recordings(), tmp_path, batch=3)
 
 
 def test_another_recording_is_refused_and_named(tmp_path: Path, cheap: list):
