@@ -7,9 +7,9 @@ import pytest
 
 import boomdp_jax
 from boomdp_jax.core.history import make_history
-from boomdp_jax.inference.block import make_block
+from boomdp_jax.inference.block import make_block, stack_blocks
+from boomdp_jax.inference.fit_starts import Guesses
 from boomdp_jax.inference.rod_guess import rod_guess
-from boomdp_jax.inference.seeds import seed_coordinates
 from boomdp_jax.physics import WORLD, rollout, scene_spec_from_dict
 
 ANCHOR, PLACE = np.array([0.2, 0.1]), np.array([0.6, 0.5])
@@ -53,22 +53,25 @@ def rod(second: str, place: np.ndarray, length: float) -> dict:
     return {"type": "distance", "a": "box", "b": second, "length": length, **ends}
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_rod_to_the_world_is_found_beside_a_wheel(seed):
-    history = moved(seed, [rod("world", PLACE, LENGTH), WHEEL])
+def test_a_rod_to_the_world_is_found_beside_a_wheel():
     box = {"name": "box", "pose": POSE.tolist(), **BOX}
     unknown = {"distance": 1, "wheel": 1}
     spec = scene_spec_from_dict({**COMMON, "bodies": [box], "unknown": unknown})
-    likelihood = make_block(spec, (0,), history).target.log_likelihood
-    z, has = seed_coordinates(likelihood.coordinates, likelihood.data.steps)
-    params = likelihood.coordinates(z, jnp.ones(2, bool))
-    found = params.distance
-    np.testing.assert_allclose(found.anchor_a[0], ANCHOR, atol=0.02)
-    np.testing.assert_allclose(found.anchor_b[0], PLACE, atol=0.06)
-    np.testing.assert_allclose(found.length[0], LENGTH, atol=0.06)
-    slot = likelihood.coordinates.layout.slots[0]
+    constraints = [rod("world", PLACE, LENGTH), WHEEL]
+    histories = [moved(seed, constraints) for seed in range(3)]
+    targets = stack_blocks([make_block(spec, (0,), history) for history in histories])
+    guesses = Guesses.of(targets)
+    coordinates = targets.log_likelihood.coordinates
+    slot = coordinates.layout.slots[0]
     assert slot.kind == "distance"
-    assert np.all(has[slot.start : slot.start + 5])
+    assert np.all(guesses.has[:, slot.start : slot.start + 5])
+    found = jax.vmap(lambda map_, z: map_(z, jnp.ones(2, bool)).distance)(
+        coordinates, jnp.asarray(guesses.z)
+    )
+    for index in range(3):
+        np.testing.assert_allclose(found.anchor_a[index, 0], ANCHOR, atol=0.02)
+        np.testing.assert_allclose(found.anchor_b[index, 0], PLACE, atol=0.06)
+        np.testing.assert_allclose(found.length[index, 0], LENGTH, atol=0.06)
 
 
 def test_a_rod_between_bodies_is_found():
