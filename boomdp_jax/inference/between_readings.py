@@ -5,7 +5,6 @@ import numpy as np
 # Readings that a parabola goes through at least, and instants before and after its own
 # that it may take them from.
 _FEWEST, _FARTHEST = 4, 24
-_IS_ANGLE = np.arange(6) == 2
 
 
 def between_readings(

@@ -6,8 +6,8 @@ were not read there is no such step. Slopes of the poses round it stand in for t
 noisier, and errors of neighbours are alike, but good enough to tell in which basin
 a fit is. Where readings are rarer than steps, or channels are read in turn, no step may
 lead from one instant that was read in full to another: what was between the readings is
-then taken from those round it. (Climbs that began with nothing called four pinned boxes
-of four carts, seen at every other step, without a doubt.)
+then taken from those round it. (Climbs that began with nothing took twelve of sixteen
+pinned boxes for free or on wheels, without a doubt.)
 
 Filters, which come after that, are given what was read and nothing else.
 """

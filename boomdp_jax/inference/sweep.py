@@ -342,13 +342,16 @@ class Sweep:
 
     def manifest(self) -> dict:
         """All that the bits of the results depend on, but for the recordings."""
+        # Mostly one and the same for thousands of recordings.
+        each = {id(spec): spec for spec in self.specs}
+        scenes = {name: _scene_bytes(spec) for name, spec in each.items()}
         return {
             "schema": SCHEMA,
             "seed": seed_of(self.key),
             "num_objects": len(self.histories),
             "batch": self.batch,
             "num_rows": self.num_rows,
-            "scenes": _hash(*map(_scene_bytes, self.specs)),
+            "scenes": _hash(*(scenes[id(spec)] for spec in self.specs)),
             **self.options,
             "float": str(jax.dtypes.canonicalize_dtype(float)),
             "platform": jax.default_backend(),
