@@ -27,9 +27,12 @@ parser.add_argument("--agents", nargs="+", choices=AGENTS, metavar="NAME")
 parser.add_argument("--seeds", type=int, default=3)
 parser.add_argument("--steps", type=int, default=100)
 parser.add_argument("--quick", action="store_true", help="one seed, no physics agent")
-parser.add_argument("--out", type=pathlib.Path, default="out/learn_while_acting")
+parser.add_argument("--out", type=pathlib.Path, help="default: out/...")
 arguments = parser.parse_args()
 
+# Episodes of another length are another run.
+name = "learn_while_acting_quick" if arguments.quick else "learn_while_acting"
+out = arguments.out or pathlib.Path("out") / name
 agents = arguments.agents or ["true", "lwr", "physics"]
 num_seeds, num_steps = arguments.seeds, arguments.steps
 if arguments.quick:
@@ -38,7 +41,7 @@ if arguments.quick:
 # %% Run every agent, each in a folder of its own
 folders = []
 for agent in agents:
-    folder = arguments.out / f"{arguments.task}-{agent}"
+    folder = out / f"{arguments.task}-{agent}"
     options = ["--seeds", str(num_seeds), "--steps", str(num_steps)]
     status = main(
         ["run", arguments.task, "--agent", agent, *options, "--out", str(folder)]
@@ -48,12 +51,12 @@ for agent in agents:
     folders.append(str(folder))
 
 # %% Curves and table
-status = main(["plot", *folders, "--out", str(arguments.out / "curves.png")])
+status = main(["plot", *folders, "--out", str(out / "curves.png")])
 if status:
     raise SystemExit(status)
 
 # %% A film of the last agent's first episode
-film = arguments.out / f"{arguments.task}-{agents[-1]}.gif"
+film = out / f"{arguments.task}-{agents[-1]}.gif"
 status = main(["view", folders[-1], "--out", str(film)])
 if status:
     raise SystemExit(status)

@@ -20,6 +20,7 @@ from boomdp_jax.core.versions import library_versions
 from boomdp_jax.envs.namo_room import KINDS
 from boomdp_jax.experiments.namo import CHARACTERS, make_room, namo_episode
 from boomdp_jax.experiments.run import SCHEMA
+from boomdp_jax.experiments.seed_files import is_done, write_seed
 
 FIELDS = ("is_solved", "seconds", "effort", "num_pushes", "num_wasted")
 """Numbers of one room in `results.npz`, beside `decision_seconds` (the median), and the
@@ -44,10 +45,10 @@ class NamoRun(NamedTuple):
         return self.folder / f"seed-{seed:05d}.npz"
 
     def missing(self, shard: tuple[int, int] = (0, 1)) -> list[int]:
-        """Rooms of a shard that have not been done yet."""
+        """Rooms of a shard that have no file yet, or one that was damaged."""
         place, num = shard
         seeds = range(place, self.num_seeds, num)
-        return [seed for seed in seeds if not self.path(seed).exists()]
+        return [seed for seed in seeds if not is_done(self.path(seed), seed)]
 
     def run_seeds(
         self,
@@ -63,7 +64,7 @@ class NamoRun(NamedTuple):
         for seed in seeds:
             room = make_room(self.room, seed, self.num_things, self.difficulty)
             record, _ = namo_episode(self.agent, room, seed, delay=self.delay)
-            write_npz(self.path(seed), arrays_of(record))
+            write_seed(self.path(seed), seed, arrays_of(record))
             if report is not None:
                 report(seed, record)
 

@@ -4,7 +4,8 @@ A folder holds `run.json` (what was begun: task, agent, steps, seeds, noise, ver
 one `seed-00000.npz` for each episode that is done, written whole or not at all, and,
 once all are, `results.npz` with leading axis `seed`. Whoever begins the same run in the
 same folder goes on where it stands; rewards, actions and states come out to the same
-bits however often it was stopped and however many machines shared it.
+bits however often it was stopped and however many machines shared it. Begun again with
+more seeds, it goes on to those.
 """
 
 import functools
@@ -27,6 +28,7 @@ from boomdp_jax.core.npz_file import read_npz, write_npz
 from boomdp_jax.core.versions import library_versions
 from boomdp_jax.envs.environment import AbstractEnvironment, EnvParams
 from boomdp_jax.experiments.registry import agent_of, check_agent, make_task
+from boomdp_jax.experiments.seed_files import is_done, write_seed
 
 SCHEMA = "boomdp-run-1"
 """Version of the folder's format."""
@@ -59,14 +61,18 @@ class Run(NamedTuple):
         Args:
             shard: place i and number n of shards; a shard has seeds i, i + n and so on.
 
+        Returns:
+            Those without a file, or with one that was damaged.
+
         Raises:
-            ValueError: no such shard.
+            ValueError: no such shard, or a file that is not of this run.
         """
         place, num = shard
         if not 0 <= place < num:
             raise ValueError(f"shard: expected 0 <= place < number, got {place}/{num}")
         seeds = range(place, self.num_seeds, num)
-        return [seed for seed in seeds if not self.path(seed).exists()]
+        length = self.num_steps
+        return [s for s in seeds if not is_done(self.path(s), s, num_steps=length)]
 
     def run_seeds(
         self,
@@ -93,7 +99,7 @@ class Run(NamedTuple):
             )
         for seed in seeds:
             record, _ = episode(jax.random.key(seed))
-            write_npz(self.path(seed), record._asdict() | made)
+            write_seed(self.path(seed), seed, record._asdict() | made)
             if report is not None:
                 report(seed, record)
 
@@ -143,7 +149,8 @@ def begin_run(
         task: name of a task.
         agent: name of an agent.
         folder: made if there is none.
-        num_seeds: episodes; their seeds are 0, 1, ...
+        num_seeds: episodes; their seeds are 0, 1, ... A run may be begun again with
+            more of them.
         num_steps: of each; default: the task's own.
         noise: standard deviation of the readings that agents learn from: position [m],
             angle [rad], velocity [m/s], spin [rad/s]; none: exact.
@@ -185,7 +192,11 @@ def begin_run(
         content["world"] = world
     path = run.folder / "run.json"
     if path.exists():
-        check_same(path, read_json(path, SCHEMA), content)
-    else:
-        write_json(path, content)
+        begun = read_json(path, SCHEMA)
+        # Episodes do not depend on how many there are: more of them go on.
+        more = {**begun, "num_seeds": max(num_seeds, begun.get("num_seeds", 0))}
+        check_same(path, more, content)
+        if begun == content:
+            return run
+    write_json(path, content)
     return run

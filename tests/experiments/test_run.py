@@ -76,6 +76,47 @@ def test_shards_share_the_work(whole, tmp_path):
         run.missing((2, 2))
 
 
+def test_more_seeds_are_added_and_none_is_taken_away(whole, tmp_path):
+    _, results = whole
+    run = begin(tmp_path, num_seeds=1)
+    run.run_seeds(run.missing())
+    run.collect()
+    before = run.path(0).stat().st_mtime_ns
+    more = begin(tmp_path)
+    assert more.missing() == [1, 2]
+    assert load_run(tmp_path).num_asked == 3
+    more.run_seeds(more.missing())
+    np.testing.assert_array_equal(more.collect()["reward"], results["reward"])
+    assert run.path(0).stat().st_mtime_ns == before
+    with pytest.raises(ValueError, match=r"num_seeds: expected 3, .* got 2"):
+        begin(tmp_path, num_seeds=2)
+
+
+def test_a_damaged_episode_is_run_again(whole, tmp_path):
+    run, results = whole
+    again = begin(tmp_path)
+    content = run.path(0).read_bytes()
+    again.path(0).write_bytes(content[: len(content) // 2])
+    again.path(1).write_bytes(b"")
+    again.path(2).write_bytes(run.path(2).read_bytes())
+    assert again.missing() == [0, 1]
+    again.run_seeds([0, 1])
+    np.testing.assert_array_equal(again.collect()["reward"], results["reward"])
+
+
+def test_an_episode_of_another_run_is_refused(whole, tmp_path):
+    run, _ = whole
+    again = begin(tmp_path)
+    again.path(1).write_bytes(run.path(2).read_bytes())
+    with pytest.raises(ValueError, match=r"seed-00001.npz: seed: expected 1, .* got 2"):
+        again.missing()
+    long = begin(tmp_path / "long", num_steps=STEPS + 1)
+    long.path(0).write_bytes(run.path(0).read_bytes())
+    message = rf"seed-00000.npz: reward: expected {STEPS + 1} steps, got {STEPS}"
+    with pytest.raises(ValueError, match=message):
+        long.missing()
+
+
 def test_another_run_does_not_go_into_the_folder(whole):
     run, _ = whole
     with pytest.raises(ValueError, match="num_steps"):
