@@ -1,11 +1,12 @@
 """What is said of a posterior besides what its own draws and filters tell."""
 
 from boomdp_jax.core.history import History
+from boomdp_jax.inference.drag_doubts import drag_reasons
 from boomdp_jax.inference.lever_doubts import lever_reasons
 from boomdp_jax.inference.posterior import Posterior, with_diagnostics
 from boomdp_jax.inference.run_breaks import run_break_reasons
 from boomdp_jax.inference.stance_doubts import stance_reasons
-from boomdp_jax.inference.still import still_notes
+from boomdp_jax.inference.still import still_notes, still_reasons
 from boomdp_jax.inference.unread import unread_notes
 from boomdp_jax.inference.unread_angles import angle_reasons
 from boomdp_jax.physics.scene_spec import SceneSpec
@@ -35,6 +36,8 @@ def with_doubts(
         *lever_reasons(spec, posterior),
         *angle_reasons(spec, history, posterior),
         *stance_reasons(spec, posterior),
+        *drag_reasons(spec, history, posterior),
+        *still_reasons(spec, history, posterior),
     ]
     if reasons:
         posterior = with_diagnostics(posterior, reasons)

@@ -1,14 +1,19 @@
-"""Bodies that nothing pushed and that did not move: what can be said of such."""
+"""Bodies that did not move, pushed or not: what can be said of such."""
 
 import numpy as np
 
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.outliers import SD_OF_MEDIAN
+from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.prior import read_prior
+from boomdp_jax.physics.params import WORLD
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 # Readings of a run that it takes to say that a body did not move, and standard errors
 # by which its halves may differ, and velocities from zero.
 _FEWEST, _NUM_ERRORS = 6, 6.0
+# By how much the probability of a pin may differ from the prior's where nothing tells.
+_MOST_GAP = 0.15
 
 
 def still_notes(spec: SceneSpec, history: History) -> list[str]:
@@ -26,19 +31,69 @@ def still_notes(spec: SceneSpec, history: History) -> list[str]:
     Returns:
         One line for each body.
     """
+    is_pushed, is_still = _pushed_and_still(spec, history)
+    return [
+        f"{spec.names[body]}: nothing pushed it and it did not move; what is said of "
+        "its constraints follows from how fast it might have been at first"
+        for body in np.flatnonzero(~is_pushed & is_still)
+    ]
+
+
+def still_reasons(spec: SceneSpec, history: History, posterior: Posterior) -> list[str]:
+    """Reasons for doubt about pins of bodies that no push has moved.
+
+    What holds such a body, friction or more, does not show, and least of all whether
+    it could turn about a point. The draws may say so all the same: runs that begin at
+    one place are what a pin explains and a free body need not do, and where a pin is
+    put before the readings are seen is wider than they tell.
+
+    Args:
+        spec: the scene.
+        history: its readings.
+        posterior: what was inferred.
+
+    Returns:
+        One line for each body whose pin is much more or less probable than a priori.
+    """
+    pins = posterior.params.revolute
+    if not spec.unknown.get("revolute", 0) or pins.active.shape[-1] == 0:
+        return []
+    expected = read_prior(spec.prior, spec.source).probability["revolute"]
+    is_pushed, is_still = _pushed_and_still(spec, history)
+    weights = np.asarray(posterior.weights, float)
+    to_world = np.asarray(pins.active) & (np.asarray(pins.body_b) == WORLD)
+    reasons = []
+    for body in np.flatnonzero(is_pushed & is_still & ~np.asarray(spec.is_static)):
+        mine = to_world & (np.asarray(pins.body_a) == body)
+        said = float(weights @ mine.any(axis=-1))
+        is_known = any(c.body_a == body for c in spec.constraints)
+        if not is_known and abs(said - expected) > _MOST_GAP:
+            reasons.append(
+                f"{spec.names[body]}: no push has moved it, so that nothing tells "
+                f"whether it is pinned; its probability of {said:.2f} is not to be "
+                "relied on: expected a push that moves it"
+            )
+    return reasons
+
+
+def _pushed_and_still(
+    spec: SceneSpec, history: History
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which bodies were pushed (or cannot be), and which did not move, `[body]`.
+
+    With gravity along the plane, or without readings, none did not.
+    """
+    num = len(spec.bodies)
     rows = np.asarray(history.mask)
     if not np.any(rows) or np.any(np.asarray(spec.scene.gravity) != 0.0):
-        return []
+        return np.ones(num, bool), np.zeros(num, bool)
     action = np.asarray(history.action)[rows]
     is_pushed = np.any(action != 0.0, axis=(0, 2)) | np.asarray(spec.is_static)
     state = np.where(history.state_mask, history.state, np.nan)[rows]
     starts = np.flatnonzero(~np.asarray(history.is_chained)[rows])
-    return [
-        f"{spec.names[body]}: nothing pushed it and it did not move; what is said of "
-        "its constraints follows from how fast it might have been at first"
-        for body in np.flatnonzero(~is_pushed)
-        if all(_is_still(run[:, body]) for run in np.split(state, starts) if len(run))
-    ]
+    runs = [run for run in np.split(state, starts) if len(run)]
+    is_still = [all(_is_still(run[:, body]) for run in runs) for body in range(num)]
+    return is_pushed, np.array(is_still)
 
 
 def _is_still(run: np.ndarray) -> bool:

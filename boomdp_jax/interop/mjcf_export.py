@@ -61,19 +61,15 @@ def to_mjcf(
     its direction; contact and restitution. All but the box and the floor go with the
     time step.
 
-    With "implicitfast" MuJoCo leaves out how a wheel couples directions: at 2 ms carts
-    end up to a third of their way from where they should, with "implicit" within a
-    hundredth. MJX has no "implicit", and takes forces in "implicitfast" to be
-    unlimited: for it write "Euler" where there are wheels, or feet and motors that
-    slip, with a time step under the mass over the viscous coefficient.
+    "implicitfast" leaves out how a wheel couples directions: carts end up to a third of
+    their way off. MJX has no "implicit", and in the other no limits of forces: for it
+    write "Euler" (time steps under the mass over the viscous coefficient).
 
     Args:
         spec: the scene; its own densities and constraints do not count.
         params: one hypothesis, unbatched, as `spec.params()` or a draw of a posterior.
-        time_step: MuJoCo's own [s]; default: the scene's in the fewest parts of at
-            most 2 ms.
-        integrator: MuJoCo's name of it; default: "implicit" if there is a wheel, else
-            "implicitfast".
+        time_step: MuJoCo's own [s]; default: the longest to 2 ms that divides `dt`.
+        integrator: default: "implicit" if there is a wheel, else "implicitfast".
 
     Returns:
         The document. Push a body by `xfrc_applied`, at its centre of mass.
@@ -87,8 +83,8 @@ def to_mjcf(
     host = _on_host(spec, params)
     if time_step is None:
         time_step = spec.dt / max(1, math.ceil(spec.dt / _MOST_TIME_STEP - 1e-9))
-    if integrator is None:
-        integrator = "implicit" if np.any(host.wheel.active) else "implicitfast"
+    usual = "implicit" if np.any(host.wheel.active) else "implicitfast"
+    integrator = usual if integrator is None else integrator
     time_step = _read_options(time_step, integrator)
     return _Writer(spec, host, time_step).write(integrator)
 
@@ -108,7 +104,7 @@ def save_mjcf(
         params: one hypothesis.
         path: where to; its folder must exist.
         time_step: MuJoCo's own [s].
-        integrator: MuJoCo's name of it, as `to_mjcf` has it.
+        integrator: as of `to_mjcf`.
 
     Raises:
         ValueError: no path; also from `to_mjcf`.

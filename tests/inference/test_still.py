@@ -4,11 +4,14 @@ import numpy as np
 import pytest
 
 from boomdp_jax.core.history import History, make_history
-from boomdp_jax.inference.still import still_notes
+from boomdp_jax.inference.still import still_notes, still_reasons
+from boomdp_jax.physics import empty_params
 from boomdp_jax.physics.scene_spec import scene_spec_from_dict
+from tests.inference.posteriors import draws_like, make_posterior
 from tests.inference.recordings import DT, NOISE, SIZE, box_scene
 
 NUM = 30
+OPEN = box_scene({"revolute": 1, "wheel": 1, "ground": 1})
 
 
 def recorded(
@@ -77,3 +80,37 @@ def test_a_few_rows_are_too_few_to_say_so():
         history.state[:3], history.action[:3], history.next_state[:3], DT
     )
     assert still_notes(box_scene(), few) == []
+
+
+def reasons_of(probability: float, scene=None, **changes) -> list[str]:
+    """Of a box that was pushed, and of ten draws of which so many have a pin."""
+    spec = OPEN if scene is None else scene
+    empty = empty_params(1, num_revolute=1, num_wheel=1, num_ground=1)
+    has_pin = (np.arange(10) < round(10 * probability))[:, None]
+    params = draws_like(empty, 10, revolute_active=has_pin)
+    posterior = make_posterior(spec, params, params)
+    return still_reasons(spec, recorded(**{"force": 0.1, **changes}), posterior)
+
+
+@pytest.mark.parametrize("probability", [0.0, 0.5, 1.0])
+def test_nothing_tells_whether_what_no_push_moves_is_pinned(probability):
+    (reason,) = reasons_of(probability)
+    assert "no push has moved it, so that nothing tells whether it is pin" in reason
+    assert f"its probability of {probability:.2f} is not to be relied on" in reason
+
+
+def test_the_prior_may_be_relied_on():
+    assert reasons_of(0.2) == []
+    content = OPEN.to_dict()
+    content["prior"] = {"probability": {"revolute": 0.9}}
+    assert reasons_of(1.0, scene_spec_from_dict(content)) == []
+    assert len(reasons_of(0.2, scene_spec_from_dict(content))) == 1
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"speed": (0.02, 0.0, 0.0)}, {"speed": (0.0, 0.0, -0.05)}, {"force": 0.0}],
+    ids=["slides", "turns", "let be"],
+)
+def test_pins_of_what_moves_or_is_let_be_are_not_doubted(changes):
+    assert reasons_of(1.0, **changes) == []
