@@ -11,7 +11,7 @@ import dataclasses
 import math
 import os
 import xml.etree.ElementTree as ET
-from typing import Literal, get_args
+from typing import get_args
 
 import jax
 import numpy as np
@@ -25,6 +25,7 @@ from boomdp_jax.interop.mjcf_elements import (
     surface,
     turned,
 )
+from boomdp_jax.interop.mjcf_integrator import Integrator, usual_integrator
 from boomdp_jax.interop.mjcf_tree import (
     Hold,
     Joint,
@@ -37,8 +38,6 @@ from boomdp_jax.physics.params import WORLD, Params
 from boomdp_jax.physics.scene_arrays import has_contact
 from boomdp_jax.physics.scene_fields import in_terms_of_json, read_number, refuse
 from boomdp_jax.physics.scene_spec import SceneSpec
-
-Integrator = Literal["implicitfast", "implicit", "Euler", "RK4"]
 
 _MOST_TIME_STEP = 0.002
 """MuJoCo's default [s]."""
@@ -62,14 +61,14 @@ def to_mjcf(
     time step.
 
     "implicitfast" leaves out how a wheel couples directions: carts end up to a third of
-    their way off. MJX has no "implicit", and in the other no limits of forces: for it
-    write "Euler" (time steps under the mass over the viscous coefficient).
+    their way off; "implicit" and "RK4" do not. MJX has no "implicit", and in the first
+    no limits: there "Euler" (time steps under mass over viscous coefficient) has them.
 
     Args:
         spec: the scene; its own densities and constraints do not count.
         params: one hypothesis, unbatched, as `spec.params()` or a draw of a posterior.
         time_step: MuJoCo's own [s]; default: the longest to 2 ms that divides `dt`.
-        integrator: default: "implicit" if there is a wheel, else "implicitfast".
+        integrator: default: "implicitfast", for wheels not too stiff for it "RK4".
 
     Returns:
         The document. Push a body by `xfrc_applied`, at its centre of mass.
@@ -83,9 +82,9 @@ def to_mjcf(
     host = _on_host(spec, params)
     if time_step is None:
         time_step = spec.dt / max(1, math.ceil(spec.dt / _MOST_TIME_STEP - 1e-9))
-    usual = "implicit" if np.any(host.wheel.active) else "implicitfast"
-    integrator = usual if integrator is None else integrator
-    time_step = _read_options(time_step, integrator)
+    time_step = _read_options(time_step, "RK4" if integrator is None else integrator)
+    if integrator is None:
+        integrator = usual_integrator(spec, host, time_step)
     return _Writer(spec, host, time_step).write(integrator)
 
 

@@ -11,7 +11,7 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from boomdp_jax.core.history import make_history
-from boomdp_jax.inference import infer
+from boomdp_jax.inference import infer_batch
 from boomdp_jax.inference.drag_doubts import drag_reasons
 from boomdp_jax.interop.object_families import hide
 from boomdp_jax.physics import empty_params, rollout, scene_spec_from_dict
@@ -220,23 +220,21 @@ def pinned(seed, *, has_wheel, num_rows=60):
 
 @pytest.mark.slow
 def test_a_pinned_cart_is_not_said_to_have_no_wheel_for_certain():
-    both, alone = (
-        [pinned(seed, has_wheel=has_wheel) for seed in range(4)]
-        for has_wheel in (True, False)
-    )
-    for cases, is_drag in ((both, True), (alone, False)):
-        posteriors = [
-            infer(jax.random.key(seed), *case) for seed, case in enumerate(cases)
-        ]
-        told = 0
-        for posterior in posteriors:
-            weights = np.asarray(posterior.weights)
-            has = np.asarray(posterior.params.wheel.active)[:, 0].any(axis=-1)
-            said = float(weights @ has)
-            diagnostics = posterior.diagnostics
-            told += any("is drag" in reason for reason in diagnostics["reasons"])
-            if is_drag:
-                assert said > 0.5 or not diagnostics["ok"], said
-            else:
-                assert said < 0.05
-        assert (told > 0) == is_drag
+    cases = [pinned(seed, has_wheel=has) for has in (True, False) for seed in (0, 1)]
+    specs, histories = zip(*cases, strict=True)
+    told = []
+    for posterior, is_cart in zip(
+        infer_batch(jax.random.key(0), specs, histories),
+        (True, True, False, False),
+        strict=True,
+    ):
+        weights = np.asarray(posterior.weights)
+        has = np.asarray(posterior.params.wheel.active)[:, 0].any(axis=-1)
+        said, diagnostics = float(weights @ has), posterior.diagnostics
+        told.append(any("is drag" in reason for reason in diagnostics["reasons"]))
+        if is_cart:
+            assert said > 0.5 or not diagnostics["ok"], said
+        else:
+            assert said < 0.05
+    assert any(told[:2])
+    assert not any(told[2:])

@@ -284,9 +284,14 @@ def test_carts_move_as_ours_unless_couplings_are_left_out(seed):
     assert gaps[1] > 5.0 * gaps[0]
 
 
-def test_without_a_wheel_the_integrator_is_one_that_mjx_has():
-    spec = WORLDS["free body"][0]
+def test_the_integrator_is_one_that_mjx_has_and_that_is_stable():
+    for name, expected in (("free body", "implicitfast"), ("wheel", "RK4")):
+        spec = WORLDS[name][0]
+        assert f'integrator="{expected}"' in to_mjcf(spec, spec.params())
+    spec, _ = wheeled(viscous=[30.0, 4e4])
     assert 'integrator="implicitfast"' in to_mjcf(spec, spec.params())
+    # Runge and Kutta's method takes a shorter time step.
+    assert 'integrator="RK4"' in to_mjcf(spec, spec.params(), time_step=2e-5)
 
 
 @pytest.mark.slow
