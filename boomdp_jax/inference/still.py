@@ -58,6 +58,9 @@ def still_reasons(spec: SceneSpec, history: History, posterior: Posterior) -> li
     pins = posterior.params.revolute
     if not spec.unknown.get("revolute", 0) or pins.active.shape[-1] == 0:
         return []
+    # What no push moves is fixed, if that is among what may be.
+    if spec.unknown.get("weld", 0):
+        return []
     expected = read_prior(spec.prior, spec.source).probability["revolute"]
     is_pushed, is_still = _pushed_and_still(spec, history)
     weights = np.asarray(posterior.weights, float)

@@ -114,3 +114,9 @@ def test_the_prior_may_be_relied_on():
 )
 def test_pins_of_what_moves_or_is_let_be_are_not_doubted(changes):
     assert reasons_of(1.0, **changes) == []
+
+
+def test_what_may_be_fixed_is_not_doubted():
+    content = OPEN.to_dict()
+    content["unknown"]["weld"] = 1
+    assert reasons_of(0.0, scene_spec_from_dict(content)) == []

@@ -15,7 +15,6 @@ import pytest
 
 from boomdp_jax.interop import save_mjcf, to_mjcf
 from boomdp_jax.interop.mjcf_export import _check_types, _read_options
-from boomdp_jax.interop.object_families import random_object
 from boomdp_jax.physics.params import Actuator
 from tests.interop.mjcf_worlds import (
     ball,
@@ -267,31 +266,6 @@ def test_file_is_the_document(tmp_path):
     assert text == to_mjcf(spec, spec.params(), integrator="RK4")
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "wheel.xml"))
     assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-
-
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_carts_move_as_ours_unless_couplings_are_left_out(seed):
-    spec = random_object(np.random.default_rng(seed), "cart")
-    params = spec.params()
-    mass = float(params.density[0]) * spec.bodies[0].area
-    wrench = [[4.0 * mass, 2.0 * mass, 0.3 * mass]]
-    ours = run_ours(spec, params, 50, wrench, dt=spec.dt / 4)
-    gaps = [
-        distance(ours, run_mujoco(to_mjcf(spec, params, **options), spec, 50, wrench))
-        for options in ({}, {"integrator": "implicitfast"})
-    ]
-    assert gaps[0] < 0.01
-    assert gaps[1] > 5.0 * gaps[0]
-
-
-def test_the_integrator_is_one_that_mjx_has_and_that_is_stable():
-    for name, expected in (("free body", "implicitfast"), ("wheel", "RK4")):
-        spec = WORLDS[name][0]
-        assert f'integrator="{expected}"' in to_mjcf(spec, spec.params())
-    spec, _ = wheeled(viscous=[30.0, 4e4])
-    assert 'integrator="implicitfast"' in to_mjcf(spec, spec.params())
-    # Runge and Kutta's method takes a shorter time step.
-    assert 'integrator="RK4"' in to_mjcf(spec, spec.params(), time_step=2e-5)
 
 
 @pytest.mark.slow
