@@ -53,3 +53,33 @@ def test_what_was_not_read_is_no_gap():
     state[:, :, :3] = np.nan
     partly = make_history(state, history.action, history.next_state, history.dt)
     assert run_break_reasons(box_scene(), partly) == []
+
+
+def with_rows_lost(seed: int, *, is_chained: bool, is_told: bool):
+    """A free box that is pushed, of whose rows a tenth was lost, and which were."""
+    rng = np.random.default_rng(seed)
+    whole = free_box(rng, 60, is_chained=is_chained)
+    lost = np.sort(rng.choice(np.arange(5, 55, 2), size=6, replace=False))
+    kept = np.delete(np.arange(60), lost)
+    episode = np.cumsum(np.diff(kept, prepend=0) > 1) if is_told else None
+    parts = (whole.state, whole.action, whole.next_state)
+    state, action, last = (np.asarray(part)[kept] for part in parts)
+    return make_history(state, action, last, 0.02, episode=episode), kept
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("is_chained", [True, False])
+def test_rows_that_were_lost_on_the_way_are_noticed(seed, is_chained):
+    history, kept = with_rows_lost(seed, is_chained=is_chained, is_told=False)
+    (reason,) = run_break_reasons(box_scene(), history)
+    assert "as if rows between them were missing; expected rows that follow" in reason
+    named = reason.split("in rows ")[1].split(" it starts")[0].split(" and ")[0]
+    after = np.flatnonzero(np.diff(kept) > 1) + 1
+    assert set(map(int, named.split(", "))) <= set(after.tolist())
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("is_chained", [True, False])
+def test_runs_that_begin_anew_after_each_gap_are_in_order(seed, is_chained):
+    history, _ = with_rows_lost(seed, is_chained=is_chained, is_told=True)
+    assert run_break_reasons(box_scene(), history) == []
