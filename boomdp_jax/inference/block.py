@@ -51,6 +51,7 @@ def make_block(
     weight: np.ndarray | None = None,
     touching: Touching | None = None,
     freedom: float | None = None,
+    is_told: bool = True,
 ) -> Block:
     """Set up the posterior of a block.
 
@@ -66,6 +67,7 @@ def make_block(
             one.
         touching: what may have touched; None: nothing collides.
         freedom: degrees of freedom of the readings' Student-t noise; None: normal.
+        is_told: whether readings tell what the bodies are, or only where.
 
     Returns:
         The block.
@@ -99,6 +101,8 @@ def make_block(
     if is_uniform is None:
         dt = np.asarray(history.dt)[np.asarray(history.mask)]
         is_uniform = bool(dt.size == 0 or np.all(dt == dt[0]))
+    if not is_told:
+        history = _unread(history)
     data = track_data(
         history, bodies, is_uniform, has_delay=layout.has_delay, freedom=freedom
     )
@@ -143,6 +147,15 @@ def _poses(history: History, bodies: tuple[int, ...]) -> np.ndarray:
             np.where(seen & np.asarray(history.mask)[:, None, None], values, np.nan)
         )
     return np.concatenate(out)
+
+
+def _unread(history: History) -> History:
+    """The same table without rows in use."""
+    is_none = {
+        name: on_device(np.zeros_like(getattr(history, name)), bool)
+        for name in ("mask", "state_mask", "next_state_mask", "is_chained")
+    }
+    return dataclasses.replace(history, **is_none)
 
 
 def _forces(history: History, bodies: tuple[int, ...]) -> np.ndarray:

@@ -41,5 +41,7 @@ def with_doubts(
     ]
     if reasons:
         posterior = with_diagnostics(posterior, reasons)
-    notes = [*unread_notes(spec, history), *still_notes(spec, history), *notes]
+    left_out = posterior.diagnostics.get("notes", [])
+    still = still_notes(spec, history, left_out)
+    notes = [*unread_notes(spec, history), *still, *notes]
     return with_notes(posterior, notes)

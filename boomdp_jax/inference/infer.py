@@ -29,6 +29,7 @@ from boomdp_jax.inference.posterior import Posterior, with_diagnostics
 from boomdp_jax.inference.residual import check_residuals
 from boomdp_jax.inference.robust_update import DEGREES_OF_FREEDOM
 from boomdp_jax.inference.sample import sample_blocks
+from boomdp_jax.inference.still import bodies_let_be, let_be_note
 from boomdp_jax.inference.structure_draws import SampleSettings
 from boomdp_jax.inference.svi import run_svi
 from boomdp_jax.inference.touching import find_touching
@@ -291,14 +292,20 @@ def _infer_structures(
         touching = find_touching(spec, trusted)
         blocks, screened = independent_blocks(spec, trusted, touching)
         missing = [likelihood.notes_on_rows(spec, b, history) for b in blocks]
-        notes.append([*screened, *itertools.chain(*missing)])
-        problems += [
-            (
-                index,
-                make_block(spec, bodies, history, touching=touching, freedom=freedom),
+        let_be = {(body,) for body in bodies_let_be(spec, trusted, touching)}
+        let_be &= set(blocks)
+        left_out = [let_be_note(spec, body) for (body,) in sorted(let_be)]
+        notes.append([*screened, *left_out, *itertools.chain(*missing)])
+        for bodies in blocks:
+            block = make_block(
+                spec,
+                bodies,
+                history,
+                touching=touching,
+                freedom=freedom,
+                is_told=bodies not in let_be,
             )
-            for bodies in blocks
-        ]
+            problems.append((index, block))
     results: dict[int, list[BlockResult]] = {i: [] for i in range(len(specs))}
     groups = _group(problems)
     with CompileClock() as clock, _Bar(progress, len(problems)) as bar:

@@ -1,22 +1,60 @@
 """Bodies that did not move, pushed or not: what can be said of such."""
 
+from collections.abc import Collection
+
 import numpy as np
 
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.outliers import SD_OF_MEDIAN
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.prior import read_prior
+from boomdp_jax.inference.touching import Touching
 from boomdp_jax.physics.params import WORLD
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 # Readings of a run that it takes to say that a body did not move, and standard errors
 # by which its halves may differ, and velocities from zero.
 _FEWEST, _NUM_ERRORS = 6, 6.0
+# Readings of a body at rest differ from one to the next as they do from any other; of
+# one that moves they differ more from those far off. By how many standard errors, and
+# how closely changes of place may follow the velocities that were read.
+_NUM_ALIKE, _LEAST_TOGETHER = 4.5, 0.5
 # By how much the probability of a pin may differ from the prior's where nothing tells.
 _MOST_GAP = 0.15
 
 
-def still_notes(spec: SceneSpec, history: History) -> list[str]:
+def bodies_let_be(
+    spec: SceneSpec, history: History, touching: Touching | None
+) -> tuple[int, ...]:
+    """Bodies that nothing pushed, that did not move, and that touch nothing.
+
+    Nothing tells what they are. A likelihood would: it starts at the first reading, so
+    that it charges a pin, and nothing else, for being where the body is, and a body
+    without friction for having been put there at rest.
+
+    Args:
+        spec: the scene.
+        history: its readings.
+        touching: what may have touched; None: nothing collides.
+    """
+    is_pushed, is_still = _pushed_and_still(spec, history)
+    is_let_be = ~is_pushed & is_still
+    if touching is not None:
+        is_let_be &= ~touching.pairs.any(axis=1)
+    return tuple(np.flatnonzero(is_let_be).tolist())
+
+
+def let_be_note(spec: SceneSpec, body: int) -> str:
+    """What is said of a body whose readings were left out for that."""
+    return (
+        f"{spec.names[body]}: nothing pushed it and it did not move, which does not "
+        "tell what it is; its readings are left out"
+    )
+
+
+def still_notes(
+    spec: SceneSpec, history: History, left_out: Collection[str] = ()
+) -> list[str]:
     """Notes about bodies at rest with nothing acting on them.
 
     At the start of a run a body may have any velocity that its first reading allows.
@@ -27,6 +65,7 @@ def still_notes(spec: SceneSpec, history: History) -> list[str]:
     Args:
         spec: the scene.
         history: its readings.
+        left_out: notes of `let_be_note`; of those bodies nothing more is said.
 
     Returns:
         One line for each body.
@@ -36,6 +75,7 @@ def still_notes(spec: SceneSpec, history: History) -> list[str]:
         f"{spec.names[body]}: nothing pushed it and it did not move; what is said of "
         "its constraints follows from how fast it might have been at first"
         for body in np.flatnonzero(~is_pushed & is_still)
+        if let_be_note(spec, int(body)) not in left_out
     ]
 
 
@@ -117,4 +157,28 @@ def _is_still(run: np.ndarray) -> bool:
     twist = twist[:, ~np.isnan(twist).any(axis=0)]
     limit = _NUM_ERRORS * twist.std(axis=0) / np.sqrt(len(run))
     is_moving = np.abs(twist.mean(axis=0)) > limit
-    return not (np.any(has_moved) or np.any(is_moving))
+    return not (np.any(has_moved) or np.any(is_moving) or _goes_to_and_fro(run, angle))
+
+
+def _goes_to_and_fro(run: np.ndarray, angle: np.ndarray) -> bool:
+    """Whether readings of one run are those of a body that comes back, as on a pin."""
+    pose = np.column_stack([run[:, :2], angle])
+    change, num = np.diff(pose, axis=0), len(run)
+    # Mean square successive difference over the variance, two for white noise: von
+    # Neumann (1941), Distribution of the ratio of the mean square successive difference
+    # to the variance.
+    size = num * pose.var(axis=0)
+    ratio = np.sum(change**2, axis=0) / np.where(size > 0, size, 1.0)
+    error = 2.0 * np.sqrt((num - 2.0) / (num**2 - 1.0))
+    if np.any((size > 0) & (ratio < 2.0 - _NUM_ALIKE * error)):
+        return True
+    # What swings fast is as far off at the next reading as at any; but then it has the
+    # velocity that takes it there.
+    middle = 0.5 * (run[1:, 3:] + run[:-1, 3:])
+    least = max(_LEAST_TOGETHER, _NUM_ALIKE / np.sqrt(num))
+    for moved, speed in zip(change.T, middle.T, strict=True):
+        moved, speed = moved - moved.mean(), speed - speed.mean()
+        length = np.sqrt(np.sum(moved**2) * np.sum(speed**2))
+        if length > 0 and np.sum(moved * speed) > least * length:
+            return True
+    return False

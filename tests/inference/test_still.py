@@ -1,10 +1,21 @@
 """Bodies at rest that nothing pushes: when a posterior says so."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from boomdp_jax.core.history import History, make_history
-from boomdp_jax.inference.still import still_notes, still_reasons
+from boomdp_jax.inference.block import make_block
+from boomdp_jax.inference.infer import infer_batch
+from boomdp_jax.inference.prior import read_prior
+from boomdp_jax.inference.still import (
+    bodies_let_be,
+    let_be_note,
+    still_notes,
+    still_reasons,
+)
+from boomdp_jax.inference.touching import Touching
 from boomdp_jax.physics import empty_params
 from boomdp_jax.physics.scene_spec import scene_spec_from_dict
 from tests.inference.posteriors import draws_like, make_posterior
@@ -67,6 +78,20 @@ def test_one_that_flies_past_a_camera_is_not(begins):
     assert still_notes(box_scene(), history) == []
 
 
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("rate", [2.0, 7.0, 20.0, 60.0])
+def test_one_that_swings_to_and_fro_is_not(rate, seed):
+    """About a pin that one camera sees from above; halves of the run look alike."""
+    rng = np.random.default_rng(seed)
+    turn = rate * DT * np.arange(NUM + 1) + rng.uniform(0.0, 2.0 * np.pi)
+    angle, spin = 0.3 * np.sin(turn), 0.3 * rate * np.cos(turn)
+    rest = np.zeros_like(angle)
+    run = np.column_stack([rest, rest, angle, rest, rest, spin])
+    run = (run + NOISE * rng.standard_normal(run.shape))[:, None]
+    history = make_history(run[:-1], np.zeros((NUM, 1, 3)), run[1:], DT)
+    assert still_notes(box_scene(), history) == []
+
+
 def test_on_a_slope_rest_does_tell_something():
     shape = {"type": "box", "half_extents": SIZE}
     content = {"schema": "planar-scene-1", "dt": DT, "gravity": [0.0, -1.0]}
@@ -80,6 +105,54 @@ def test_a_few_rows_are_too_few_to_say_so():
         history.state[:3], history.action[:3], history.next_state[:3], DT
     )
     assert still_notes(box_scene(), few) == []
+
+
+def test_what_is_let_be_is_left_out():
+    """Whose readings tell where it is, and nothing of what it is."""
+    assert bodies_let_be(OPEN, recorded(), None) == (0,)
+    assert bodies_let_be(OPEN, recorded(force=0.1), None) == ()
+    told, untold = (
+        make_block(OPEN, (0,), recorded(), is_told=is_told).target
+        for is_told in (True, False)
+    )
+    z = jnp.full(told.dim, 0.3)
+    for structure in map(jnp.asarray, range(told.num_structures)):
+        expected = untold.log_prior_density(structure, z)
+        found = untold.log_density(structure, z)
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
+        assert abs(float(told.log_density(structure, z) - expected)) > 1.0
+    places = [t.log_likelihood.coordinates.surroundings for t in (told, untold)]
+    for one, other in zip(*map(jax.tree.leaves, places), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_what_may_have_been_touched_is_not_let_be():
+    touching = Touching(np.ones((1, 1), bool), {})
+    assert bodies_let_be(OPEN, recorded(), touching) == ()
+
+
+def test_a_body_whose_readings_are_left_out_is_named_once():
+    note = let_be_note(box_scene(), 0)
+    assert "box: nothing pushed it and it did not move" in note
+    assert "its readings are left out" in note
+    assert still_notes(box_scene(), recorded(), [note]) == []
+
+
+@pytest.mark.slow
+def test_of_what_is_let_be_the_prior_is_believed():
+    """Where readings count, pins have 0.00 to 0.26 and friction has 0.95 and more."""
+    histories = [recorded(seed=seed) for seed in range(6)]
+    found = infer_batch(jax.random.key(0), [OPEN] * 6, histories)
+    expected = read_prior(OPEN.prior, OPEN.source).probability
+    for posterior in found:
+        assert posterior.diagnostics["ok"], posterior.diagnostics["reasons"]
+        for kind in ("revolute", "wheel", "ground"):
+            slots = np.asarray(getattr(posterior.params, kind).active)
+            has_one = slots.reshape(len(slots), -1).any(axis=1)
+            share = float(np.asarray(posterior.weights) @ has_one)
+            # Five standard errors of a quarter as many independent draws.
+            error = np.sqrt(0.25 * 4 / posterior.num_draws)
+            assert share == pytest.approx(expected[kind], abs=5 * error)
 
 
 def reasons_of(probability: float, scene=None, **changes) -> list[str]:
