@@ -32,6 +32,7 @@ from boomdp_jax.inference.online_state import (
     Suspicion,
     Tally,
 )
+from boomdp_jax.inference.online_step import FIRST_TEST
 from boomdp_jax.inference.online_window import in_whole_table, windowed
 from boomdp_jax.inference.resampling import systematic
 from boomdp_jax.inference.structure_draws import start_mixtures
@@ -39,9 +40,6 @@ from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.typical_noise import typical_noise
 from boomdp_jax.inference.warm_modes import Known, warm_modes
 from boomdp_jax.physics.scene_spec import SceneSpec
-
-FIRST_TEST = 4
-"""A change is looked for when so many rows have come since readings grew odd."""
 
 # Rows are fitted from what is known where they are at most so many times those fitted
 # before, and where no body went that much farther, in terms of what anchors of pins are

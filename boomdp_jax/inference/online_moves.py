@@ -52,6 +52,26 @@ def effective_sample_size(log_weight: Float[Array, " particle"]) -> FloatScalar:
     return jnp.exp(-logsumexp(2.0 * log_weight))
 
 
+def distinct_sample_size(particles: ParticleSet) -> FloatScalar:
+    """Kish's number where copies of a particle, as resampling makes them, are one.
+
+    Equal weights say nothing of a cloud that was drawn from two particles.
+
+    Args:
+        particles: with normalised log-weights.
+    """
+    num, dim = particles.z.shape
+    # Equal particles have equal sums, and others hardly ever have.
+    factor = jnp.sqrt(jnp.arange(2.0, 2.0 + dim, dtype=particles.z.dtype))
+    name = jnp.sum(particles.z * factor[None], axis=1) + particles.structure
+    order = jnp.argsort(name)
+    is_new = jnp.diff(name[order], prepend=jnp.nan) != 0
+    copy = jnp.cumsum(is_new) - 1
+    weight = jnp.exp(particles.log_weight)[order]
+    whole = jax.ops.segment_sum(weight, copy, num, indices_are_sorted=True)
+    return jnp.sum(weight) ** 2 / jnp.sum(whole**2)
+
+
 def resample(key: Key, particles: ParticleSet) -> ParticleSet:
     """Draw particles by weight, systematically (Kitagawa 1996), to equal weights."""
     num = particles.log_weight.shape[0]

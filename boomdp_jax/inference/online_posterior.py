@@ -18,6 +18,7 @@ from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.noise_levels import without_levels
 from boomdp_jax.inference.one_step import NOISE_SHAPE
 from boomdp_jax.inference.online_likelihood import levels_of, log_likelihoods
+from boomdp_jax.inference.online_moves import distinct_sample_size
 from boomdp_jax.inference.online_state import BlockBelief
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.resampling import systematic
@@ -175,11 +176,10 @@ def _result(
     noise = reference * np.sqrt(rate / rng.gamma(NOISE_SHAPE + 0.5 * num))
     # Between refits the noise of the motion is one of a few.
     impulse = np.asarray(belief.champions.noise.impulse)
-    weight = np.exp(np.asarray(particles.log_weight, float))
-    size = float(weight.sum() ** 2 / (weight**2).sum())
+    num_all, size = len(level), float(distinct_sample_size(particles))
     reasons = []
-    if size < _LEAST_SHARE * len(weight):
-        reasons.append(f"{size:.0f} of {len(weight)} particles are left in effect")
+    if size < _LEAST_SHARE * num_all:
+        reasons.append(f"{size:.0f} of {num_all} particles are left in effect")
     if int(belief.fit.num_rows) == 0 and np.any(num > 0):
         reasons.append("nothing has been fitted yet: particles are draws of the prior")
     verdict = ChainDiagnostics(

@@ -27,14 +27,13 @@ from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.noise_level import NoiseFit
 from boomdp_jax.inference.noise_levels import evenly_levelled
 from boomdp_jax.inference.online_fit import (
-    FIRST_TEST,
     Fitter,
     RefitSettings,
     assemble_belief,
     num_levels_for,
 )
 from boomdp_jax.inference.online_state import BlockBelief, FitRecord, Suspicion
-from boomdp_jax.inference.online_step import ALARM
+from boomdp_jax.inference.online_step import ALARM, FIRST_TEST
 from boomdp_jax.inference.structure_draws import start_mixtures
 from boomdp_jax.inference.target import StructureTarget
 
@@ -195,9 +194,12 @@ def refit_block(
         next_test = 2 * num_after if is_open else FIRST_TEST
         if is_changed:
             account, begin = after, since
+    # What came before a change could be looked for still counts when it can be.
+    is_early = not is_asked and 0 <= since and num_after < FIRST_TEST
+    log_factor = suspicion.log_factor
     kept = Suspicion(
-        log_factor=jnp.zeros_like(suspicion.log_factor),
-        since=on_device(since if is_open else -1, suspicion.since.dtype),
+        log_factor=log_factor if is_early else jnp.zeros_like(log_factor),
+        since=on_device(since if is_open or is_early else -1, suspicion.since.dtype),
         test_after=on_device(next_test, suspicion.test_after.dtype),
         is_open=on_device(is_open, bool),
     )

@@ -13,6 +13,7 @@ from boomdp_jax.inference.online_rows import append_row, can_happen, new_row, sh
 from boomdp_jax.inference.online_state import BeliefState
 from boomdp_jax.inference.online_step import (
     ALARM,
+    FIRST_TEST,
     BlockInfo,
     drop_block_rows,
     refresh_block,
@@ -38,7 +39,7 @@ class OnlineInfo(NamedTuple):
     is_stale: BoolScalar
     """The table has grown by half, or been half renewed, since the last refit."""
     is_degenerate: Bool[Array, " block"]
-    """Next to no particle agrees with the readings."""
+    """Next to no particle agrees with the readings, or all are copies of a few."""
     is_surprised: Bool[Array, " block"]
     """Readings have looked unlike what was expected for several rows."""
     is_finite: BoolScalar
@@ -99,12 +100,15 @@ def refresh(
     num_seen = belief.num_seen + 1
     num_particles = belief.blocks[0].particles.log_weight.shape[-1]
     fewest = max(_FEWEST, _FEWEST_SHARE * num_particles)
-    is_degenerate = info.effective_sample_size < fewest
+    is_degenerate = info.distinct_sample_size < fewest
     is_degenerate = is_degenerate & (num_seen >= belief.refit_after)
     is_stale = num_seen >= belief.refit_at
     # Where odd readings are too few yet to look for a change, a fit would take two
-    # worlds for one.
-    is_waiting = jnp.any((info.log_surprise > ALARM) & ~info.is_surprised)
+    # worlds for one, and the noise for large enough to hide it.
+    num_odd = index + 1 - info.surprised_since
+    is_early = (info.log_surprise > 0) & (num_odd < FIRST_TEST)
+    is_alarmed = (info.log_surprise > ALARM) & ~info.is_surprised
+    is_waiting = jnp.any(is_early | is_alarmed)
     is_due = (is_stale | jnp.any(is_degenerate)) & ~is_waiting
     belief = BeliefState(
         key=key,

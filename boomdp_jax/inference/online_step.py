@@ -31,6 +31,7 @@ from boomdp_jax.inference.online_likelihood import (
     track_points,
 )
 from boomdp_jax.inference.online_moves import (
+    distinct_sample_size,
     effective_sample_size,
     fit_mixture,
     move_particles,
@@ -59,6 +60,8 @@ _KEPT_SHARE = 0.5
 _MISFIT, _MOST_NATS = 5.0, 8.0
 ALARM = 10.0
 """Cumulative log Bayes factor from which on readings count as odd."""
+FIRST_TEST = 4
+"""A change is looked for when so many rows have come since readings grew odd."""
 
 
 class BlockInfo(NamedTuple):
@@ -66,6 +69,8 @@ class BlockInfo(NamedTuple):
 
     effective_sample_size: Float[Array, "*block"]
     """Of the weights after the transition, before any resampling."""
+    distinct_sample_size: Float[Array, "*block"]
+    """The same where copies that resampling made before count as one particle."""
     is_resampled: Bool[Array, "*block"]
     acceptance: Float[Array, "*block"]
     """Share of this refresh's proposals that were accepted."""
@@ -149,6 +154,7 @@ def refresh_block(
     num_old = block.particles.log_weight.shape[0]
     block, weights = _filter_row(block, row, index, forgetting)
     size = effective_sample_size(weights.log_weight)
+    distinct = distinct_sample_size(block.particles)
     is_resampled = size < _KEPT_SHARE * num_old
     resample_key, move_key = jax.random.split(key)
     block = jax.lax.cond(
@@ -167,6 +173,7 @@ def refresh_block(
     block = eqx.tree_at(lambda b: b.suspicion, moved.block, suspicion)
     return block, BlockInfo(
         effective_sample_size=size,
+        distinct_sample_size=distinct,
         is_resampled=is_resampled,
         acceptance=moved.num_accepted / jnp.maximum(moved.num_proposed, 1.0),
         log_predictive=weights.log_predictive,

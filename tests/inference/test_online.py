@@ -96,6 +96,19 @@ def test_a_wheel_that_locks_is_found_out_and_the_table_overflows_in_one_program(
     check_consistency(belief)
 
 
+def test_a_change_that_few_particles_survive_is_not_taken_for_noise(online):
+    """One odd row leaves next to none; a refit of all rows then would hide it."""
+    found_at = []
+    for seed in range(20, 24):
+        rows = simulate(seed, ["cart"] * 40 + ["locked"] * 20)
+        _, found = followed(online, online.init(jax.random.key(seed)), rows)
+        changes = [k for k, o in enumerate(found) if o.refit and o.refit.has_changed]
+        assert len(changes) <= 1
+        found_at += changes
+    assert len(found_at) >= 3
+    assert all(40 <= at < 56 for at in found_at)
+
+
 def test_steps_alone_hold_their_sums_through_gaps_and_overflow(online):
     rows = simulate(7, ["cart"] * 80)
     gaps = np.random.default_rng(0).random((2, 80, 6)) < 0.2

@@ -13,6 +13,7 @@ from boomdp_jax.inference.kalman import Estimate, NoiseLevel
 from boomdp_jax.inference.mixture_building import add_spare_components
 from boomdp_jax.inference.online_likelihood import _chunks
 from boomdp_jax.inference.online_moves import (
+    distinct_sample_size,
     effective_sample_size,
     fit_mixture,
     resample,
@@ -219,6 +220,29 @@ def test_effective_sample_size_of_equal_and_of_single_weights():
     assert float(size) == pytest.approx(50.0)
     one = jnp.full(50, -jnp.inf).at[3].set(0.0)
     assert float(effective_sample_size(one)) == pytest.approx(1.0)
+
+
+def test_copies_of_a_particle_count_as_one():
+    """Three hypotheses, of which resampling made 6, 3 and 1; one in two structures."""
+    z = np.repeat([[0.3, -1.2], [0.3, 0.7], [2.0, 0.7]], [6, 3, 1], axis=0)
+    z = z[np.random.default_rng(0).permutation(10)]
+    equal = particle_set(np.zeros(10), z, np.full(10, -np.log(10.0)))
+    expected = 1.0 / (0.6**2 + 0.3**2 + 0.1**2)
+    assert float(distinct_sample_size(equal)) == pytest.approx(expected)
+    structure = np.where(z[:, 1] == 0.7, np.arange(10) % 2, 0)
+    parts = np.unique(np.column_stack([structure, z]), axis=0, return_counts=True)[1]
+    both = particle_set(structure, z, np.full(10, -np.log(10.0)))
+    expected = 1.0 / np.sum((parts / 10.0) ** 2)
+    assert float(distinct_sample_size(both)) == pytest.approx(expected)
+
+
+def test_particles_that_are_all_different_count_by_their_weights():
+    rng = np.random.default_rng(1)
+    weight = rng.gamma(0.3, size=400)
+    weight /= weight.sum()
+    cloud = particle_set(np.zeros(400), rng.normal(size=(400, 9)), np.log(weight))
+    found = float(distinct_sample_size(cloud))
+    assert found == pytest.approx(float(effective_sample_size(cloud.log_weight)))
 
 
 @pytest.mark.slow
