@@ -31,6 +31,7 @@ from boomdp_jax.inference.residual_regression import (
     fit_law,
     whiteness,
 )
+from boomdp_jax.inference.residual_spread import SpreadGrowth, spread_growth
 from boomdp_jax.inference.sample import BlockDraws
 from boomdp_jax.inference.summary import CHANNELS
 from boomdp_jax.inference.target import StructureTarget
@@ -73,6 +74,8 @@ class ResidualCheck(NamedTuple):
     """Best first; none where readings were too few, or where the filter failed."""
     whiteness: list[dict[str, float]]
     """Of each body, p-value by channel group."""
+    growth: tuple[SpreadGrowth | None, ...] = ()
+    """Of each body, whether its readings err more the faster it moves."""
 
 
 def check_residuals(targets: StructureTarget, draws: BlockDraws) -> list[ResidualCheck]:
@@ -147,7 +150,8 @@ class _Block:
             self._wrench = self._wrench + np.asarray(bias, float)
         scene = coordinates.scene
         mass = np.asarray(first.density, float) * np.asarray(scene.area, float)
-        inertia = mass * np.asarray(scene.gyration, float)
+        gyration = np.asarray(scene.gyration, float)
+        inertia, self._radius = mass * gyration, np.sqrt(gyration)
         self._inertia = np.stack([mass, mass, inertia], axis=-1)
         self._dt = np.broadcast_to(np.asarray(steps.dt, float), len(self._command))
         host = Host.of(targets)
@@ -186,7 +190,8 @@ class _Block:
             if fit is not None:
                 found.append(BodyLaw(body, law, fit))
         found.sort(key=lambda one: -one.fit.log_bayes_factor)
-        return ResidualCheck(len(rows), found, self._whiteness(base, counts))
+        growth = self._growth(base, counts, paths)
+        return ResidualCheck(len(rows), found, self._whiteness(base, counts), growth)
 
     def _counts(self) -> np.ndarray:
         counts = self._filtered.gains.counts
@@ -301,6 +306,16 @@ class _Block:
         step = np.clip(step, 1e-3 * unit, 1e3 * unit)
         safe = np.where(step > 0, step, 1.0)
         return change(step) / safe[:, None, None, None, None]
+
+    def _growth(
+        self, base: np.ndarray, counts: np.ndarray, paths: list[Path]
+    ) -> tuple[SpreadGrowth | None, ...]:
+        return tuple(
+            spread_growth(
+                base[:, 1, body], counts[:, 1, body], path.twist, self._radius[body]
+            )
+            for body, path in enumerate(paths)
+        )
 
     def _whiteness(self, base: np.ndarray, counts: np.ndarray) -> list[dict]:
         track = np.cumsum(np.asarray(self._data.is_start) > 0)

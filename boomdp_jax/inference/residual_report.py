@@ -17,6 +17,8 @@ for innovations that are said to be correlated."""
 # (noise of 0 to 15 %, pin, wheel and friction unknown) a cart with a dry wheel reached
 # 8.6. Of 21 of 100 steps two were above 10: such carts, whose posteriors were wrong.
 _MARGIN = 3.0
+# Probability by chance below which readings are said to err more at higher speeds.
+_GROWTH_BY_CHANCE = 1e-4
 # Laws of each block that are listed.
 _MOST_LAWS = 3
 _NUM_GROUPS = 4
@@ -30,7 +32,8 @@ def report_residuals(
     A Bayes factor has a mean of one where the law is not there, so that it exceeds K /
     a with a probability under a / K (Markov's inequality): with K laws of all bodies
     together, what exceeds that by a margin is a doubt. Correlated innovations without
-    such a law are a note: readings of real sensors are often not white.
+    such a law are a note: readings of real sensors are often not white. So are those
+    that err more the faster a body moves.
 
     Args:
         spec: the scene.
@@ -39,7 +42,8 @@ def report_residuals(
     Returns:
         An entry of every block that was checked: `bodies`, `rows`, `threshold` for the
         `log_bayes_factor` of a law, the best `laws` with coefficients and their sds,
-        and `whiteness`, p-values by body and channel group; reasons for doubt; notes.
+        `whiteness`, p-values by body and channel group, and `spread`, how errors grow
+        with speed by body; reasons for doubt; notes.
     """
     checked = [result for result in results if result.residual is not None]
     num_bodies = sum(len(result.block.bodies) for result in checked)
@@ -68,6 +72,21 @@ def report_residuals(
                     f"time (p = {worst[1]:.1g}): noise that is not white, or motion of "
                     "which the model has no law"
                 )
+        spread = {
+            name: growth._asdict()
+            for name, growth in zip(names, check.growth, strict=False)
+            if growth is not None
+        }
+        for name, growth in spread.items():
+            if growth["p_value"] < _GROWTH_BY_CHANCE / max(num_bodies, 1):
+                notes.append(
+                    f"{name}: its readings err more the faster it moves, "
+                    f"{growth['slow']:.2g} times as much as expected where it is slow "
+                    f"and {growth['fast']:.2g} times where it is fast (p = "
+                    f"{growth['p_value']:.1g}): noise of the motion that is not the "
+                    "same at all speeds, so that what is predicted of fast motion is "
+                    "too sure"
+                )
         entries.append(
             {
                 "bodies": names,
@@ -75,6 +94,7 @@ def report_residuals(
                 "threshold": threshold,
                 "laws": [_entry(names, law) for law in check.laws[:_MOST_LAWS]],
                 "whiteness": whiteness,
+                "spread": spread,
             }
         )
     return entries, reasons, notes
