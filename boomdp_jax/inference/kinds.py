@@ -41,6 +41,13 @@ from boomdp_jax.inference.kind_problem import kind_data, settle, structures_in_u
 from boomdp_jax.inference.kind_state import KindData, Tallies
 from boomdp_jax.inference.kinds_file import LearntKinds
 from boomdp_jax.inference.kinds_posterior import KindsPosterior
+from boomdp_jax.inference.kinds_verdict import (
+    kind_notes,
+    merged_diagnostics,
+    resting_bodies,
+    verdict_on_learnt,
+    with_kind_doubts,
+)
 from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.sample import BlockDraws
@@ -82,7 +89,8 @@ def infer_kinds(
         specs: the scene, or several whose bodies may have the same constraints.
         histories: one for each scene. Bodies that rest and are not pushed tell nothing.
         prior_kinds: kinds learnt before, `KindsPosterior.kinds` or `load_kinds`; each
-            chain takes one draw of them as it is, with what was prior to it.
+            chain takes one draw of them as it is, with what was prior to it. Notes say
+            where they were learnt with diagnostics that were not ok.
         concentration: how readily bodies are of new kinds; default: inferred. 0, with
             `prior_kinds`: never, recognition among a fixed list.
         use_labels: whether labels count.
@@ -94,7 +102,8 @@ def infer_kinds(
         num_samples: sweeps of each that are kept.
 
     Returns:
-        A posterior of each scene, and which bodies are of one kind.
+        A posterior of each scene, and which bodies are of one kind; `diagnostics` of
+        all scenes, often not ok.
 
     Raises:
         TypeError: a key, scene, history, kinds or prior that are none.
@@ -189,6 +198,13 @@ def infer_kinds_of(
     kept = np.arange(0, draws.kind.shape[1], _stride(draws))
     has_before = prior_kinds is not None
     posteriors = _posteriors(key, specs, histories, objects, draws, kept, has_before)
+    posteriors = [
+        with_kind_doubts(
+            posterior, histories[scene], resting_bodies(objects, scene), prior_kinds
+        )
+        for scene, posterior in enumerate(posteriors)
+    ]
+    ok, reasons = verdict_on_learnt(merged_diagnostics(posteriors), prior_kinds)
     chains = draws.kind[:, kept].reshape(-1, data.num_objects)
     layout = objects.bodies[0].block.layout
     last = draws.state
@@ -209,6 +225,8 @@ def infer_kinds_of(
             scales=prior_scales_of(objects.bodies[0].block),
             prior=prior,
             versions=library_versions(),
+            ok=ok,
+            reasons=reasons,
         ),
     )
 
@@ -354,7 +372,7 @@ def _posteriors(
             spec,
             results[scene],
             seconds={},
-            notes=[*_notes(objects, spec, scene), *untouched_notes(spec)],
+            notes=[*kind_notes(objects, spec, scene), *untouched_notes(spec)],
             method="kinds",
         )
         posteriors.append(
@@ -365,23 +383,6 @@ def _posteriors(
             )
         )
     return posteriors
-
-
-def _notes(objects: ObjectsAlone, spec: SceneSpec, scene: int) -> list[str]:
-    notes = ["bodies are taken not to be tied to each other"]
-    mine = [body for body in objects.bodies if body.scene == scene]
-    at_rest = [body.name for body in mine if body.bumps is None]
-    if at_rest:
-        notes.append(
-            f"known by their kinds alone, never in motion: {', '.join(at_rest)}"
-        )
-    given = [b.name for b in mine if spec.bodies[b.body].density is not None]
-    if given:
-        notes.append(
-            "densities that the scene gives tell nothing of others of a kind: "
-            f"{', '.join(given)}"
-        )
-    return notes
 
 
 def _coordinates(body: BodyAlone) -> Coordinates:

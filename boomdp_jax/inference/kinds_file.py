@@ -15,7 +15,8 @@ from boomdp_jax.inference.kind_state import Tallies
 from boomdp_jax.inference.prior import DEFAULT_SCALES
 
 SCHEMA = "boomdp-kinds-2"
-_MAX_HEADER_BYTES = 2**20
+# Every body of every scene may have a dozen reasons for doubt.
+_MAX_HEADER_BYTES = 2**24
 _SHAPES = {
     "count": (),
     "structure": ("structure",),
@@ -63,6 +64,11 @@ class LearntKinds:
     """Prior of each number of a body, in units of which kinds have theirs."""
     prior: KindPrior
     versions: dict[str, str]
+    ok: bool | None = None
+    """Whether diagnostics were ok wherever they were learnt, kinds given before
+    included; None: not known, as files of older versions do not say."""
+    reasons: tuple[str, ...] = ()
+    """Why not."""
 
     @property
     def num_draws(self) -> int:
@@ -84,6 +90,7 @@ class LearntKinds:
             "scales": self.scales,
             "prior": self.prior._asdict(),
             "versions": dict(self.versions),
+            "diagnostics": {"ok": self.ok, "reasons": list(self.reasons)},
         }
         text = json.dumps(header, allow_nan=False)
         arrays = {"header": np.frombuffer(text.encode(), np.uint8)}
@@ -128,6 +135,7 @@ def load_kinds(path: str | os.PathLike) -> LearntKinds:
     num_spreads = max(len(prior.spreads), len(prior.outline_spreads))
     if arrays["spread"].min() < 0 or arrays["spread"].max() >= num_spreads:
         raise ValueError(f"{path}: spread: expected indices under {num_spreads}")
+    ok, reasons = _read_verdict(path, header)
     return LearntKinds(
         tallies=Tallies(**{name: arrays[name] for name in Tallies._fields}),
         spread=arrays["spread"],
@@ -139,7 +147,27 @@ def load_kinds(path: str | os.PathLike) -> LearntKinds:
         scales=_read_scales(path, header["scales"]),
         prior=prior,
         versions=header["versions"],
+        ok=ok,
+        reasons=reasons,
     )
+
+
+def _read_verdict(
+    path: str | os.PathLike, header: dict
+) -> tuple[bool | None, tuple[str, ...]]:
+    """Whether diagnostics were ok and why not; older files have none."""
+    found = header.get("diagnostics", {"ok": None, "reasons": []})
+    ok, reasons = None, None
+    if isinstance(found, dict):
+        ok, reasons = found.get("ok"), found.get("reasons")
+    if not isinstance(ok, bool | None) or not (
+        isinstance(reasons, list) and all(isinstance(each, str) for each in reasons)
+    ):
+        raise ValueError(
+            f"{path}: diagnostics: expected ok and a list of reasons, got "
+            f"{str(found)[:80]!r}"
+        )
+    return ok, tuple(reasons)
 
 
 def _read_scales(path: str | os.PathLike, scales: dict) -> dict:

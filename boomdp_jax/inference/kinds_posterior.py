@@ -2,14 +2,16 @@
 
 import collections
 import os
-from typing import Any
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
 from boomdp_jax.inference.kinds_file import LearntKinds
+from boomdp_jax.inference.kinds_verdict import first_few, merged_diagnostics
 from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.report_table import note_lines, verdict_line
+from boomdp_jax.inference.summary import plain
 
 
 class KindsPosterior(eqx.Module):
@@ -37,6 +39,11 @@ class KindsPosterior(eqx.Module):
     def posterior(self) -> Posterior:
         """Of the first scene."""
         return self.posteriors[0]
+
+    @property
+    def diagnostics(self) -> dict:
+        """`ok` where all scenes are, `reasons` and `notes` of all, worst numbers."""
+        return merged_diagnostics(self.posteriors)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -108,17 +115,16 @@ class KindsPosterior(eqx.Module):
                     "structure": dict(likely),
                 }
             )
-        diagnostics: dict[str, Any] = dict(self.posterior.diagnostics)
         return {
             "schema": "boomdp-kinds-report-1",
             "num_kinds": {str(k): p for k, p in self.num_kinds().items()},
             "concentration": float(np.median(self.concentration)),
             "groups": groups,
-            "diagnostics": diagnostics,
+            "diagnostics": plain(self.diagnostics),
         }
 
     def summary(self) -> str:
-        """A table for people."""
+        """A table for people: kinds, groups of bodies, diagnostics of all scenes."""
         report = self.to_json()
         lines = [
             "kinds  "
@@ -136,6 +142,11 @@ class KindsPosterior(eqx.Module):
                 f"{density['q95']:.3g}) kg/m²",
                 f"    {what}",
             ]
+        verdict = report["diagnostics"]
+        # Every number of every body may have a reason: a hundred would be no table.
+        reasons = first_few(verdict["reasons"], "diagnostics['reasons']")
+        notes = first_few(verdict.get("notes", []), "diagnostics['notes']")
+        lines += ["", verdict_line(verdict["ok"], reasons), *note_lines(notes)]
         return "\n".join(lines)
 
     def save(self, path: str | os.PathLike) -> None:

@@ -47,7 +47,9 @@ def isolated_readings(
     return is_far_first & starts, is_far_last & ends
 
 
-def outlier_notes(spec: SceneSpec, history: History) -> list[str]:
+def outlier_notes(
+    spec: SceneSpec, history: History, remedy: str = "outliers='student-t'"
+) -> list[str]:
     """Notes about readings that normal noise alone does not explain.
 
     Motion by fits and starts, as on a dry floor, has such readings as well: 162 of 700
@@ -58,6 +60,7 @@ def outlier_notes(spec: SceneSpec, history: History) -> list[str]:
     Args:
         spec: the scene, for names.
         history: its readings.
+        remedy: what to do about gross errors.
 
     Returns:
         One line for each body with more than a few.
@@ -71,8 +74,7 @@ def outlier_notes(spec: SceneSpec, history: History) -> list[str]:
         if count >= max(_LEAST, _LEAST_SHARE * num):
             notes.append(
                 f"{name}: {count} of {num} readings lie far from those before and "
-                "after, by sudden motion or by gross errors; with such, "
-                "outliers='student-t'"
+                f"after, by sudden motion or by gross errors; with such, {remedy}"
             )
     return notes
 

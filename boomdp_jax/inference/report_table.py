@@ -101,11 +101,20 @@ def format_report(report: dict, structures: dict[str, float], num_draws: int) ->
     text = "not computed" if evidence is None else f"{evidence:.2f}"
     lines += ["", f"log-evidence  {text} ({num_draws} draws)"]
     diagnostics = report["diagnostics"]
-    reasons = "; ".join(diagnostics["reasons"])
-    lines.append(f"diagnostics   {'ok' if diagnostics['ok'] else 'NOT OK: ' + reasons}")
+    lines.append(verdict_line(diagnostics["ok"], diagnostics["reasons"]))
     lines += _further_laws(diagnostics.get("residual", []))
-    lines += [f"note          {note}" for note in diagnostics.get("notes", [])]
+    lines += note_lines(diagnostics.get("notes", []))
     return "\n".join(lines)
+
+
+def verdict_line(ok: bool, reasons: list[str]) -> str:
+    """Whether diagnostics are ok, and why not."""
+    return f"diagnostics   {'ok' if ok else 'NOT OK: ' + '; '.join(reasons)}"
+
+
+def note_lines(notes: list[str]) -> list[str]:
+    """A line of each note."""
+    return [f"note          {note}" for note in notes]
 
 
 def _noise_meaning(freedom: float | None) -> str:
