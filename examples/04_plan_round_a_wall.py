@@ -6,7 +6,7 @@ The planner knows the cart as a model only, a function from a state and a push t
 next state, and merges what is alike, so that it looks 28 pushes ahead in a few
 thousand calls of the model.
 
-Expect the cart to go down through one gap, to the right and up through another, without
+Expect the cart to go up through one gap, to the right and down through another, without
 a map, and a picture of the tree of the first decision: colours are levels, large dots
 are states that many paths share, the red branch is the plan.
 

@@ -64,18 +64,22 @@ def _draw_samples(arguments: argparse.Namespace, folder: Path) -> None:
     task = make_task(_TASK)
     place, num = arguments.shard or (0, 1)
     curves: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    # All names are looked at before the first learner takes its minutes.
+    asked = []
     for agent in _named(arguments.agents) or _LEARNERS:
         paths = [
             folder / "runs" / f"{_TASK}-samples-{agent}" / f"seed-{seed:05d}.npz"
             for seed in range(arguments.seeds)
         ]
-        paths[0].parent.mkdir(parents=True, exist_ok=True)
         missing = [
             seed
             for seed in range(place, arguments.seeds, num)
             if not paths[seed].exists()
         ]
         found = sample_errors(agent, task, task.default_params(), missing)
+        asked.append((agent, paths, missing, found))
+    for agent, paths, missing, found in asked:
+        paths[0].parent.mkdir(parents=True, exist_ok=True)
         for count, (seed, errors) in enumerate(zip(missing, found, strict=True)):
             write_npz(paths[seed], errors._asdict())
             print(f"{agent}: {count + 1}/{len(missing)}", file=sys.stderr)

@@ -81,3 +81,12 @@ def test_a_figure_is_one_command_that_goes_on(tmp_path, capsys):
 def test_an_unknown_figure_is_refused(tmp_path, capsys):
     assert cli.main(["figure", "3c", "--out", str(tmp_path)]) == 2
     assert "invalid choice: '3c'" in capsys.readouterr().err
+
+
+def test_an_agent_that_learns_nothing_is_refused_before_any_other_runs(
+    tmp_path, capsys
+):
+    command = ["figure", "1a", "--agents", "lr", "nonsense", "--seeds", "1"]
+    assert cli.main([*command, "--out", str(tmp_path)]) == 2
+    assert "agent: expected one that learns" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
