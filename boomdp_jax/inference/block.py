@@ -9,6 +9,7 @@ import numpy as np
 from boomdp_jax.core.arrays import on_device
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.block_contact import block_contact
+from boomdp_jax.inference.components import why_joined
 from boomdp_jax.inference.coordinates import Coordinates, surroundings
 from boomdp_jax.inference.filtered_likelihood import FilteredLikelihood
 from boomdp_jax.inference.kalman import channel_scale
@@ -71,6 +72,10 @@ def make_block(
 
     Returns:
         The block.
+
+    Raises:
+        ValueError: as `block_layout` and `structures` have it; it says why the bodies
+            are one block.
     """
     # An empty table needs room for one row, from which shapes can be told.
     history = history.padded(max(history.capacity, 1))
@@ -79,15 +84,22 @@ def make_block(
     if touching is not None and touching.pairs[list(bodies)].any():
         contact = block_contact(spec, bodies, touching)
         inferred = touching.inferred_in(spec, bodies)
-    layout = block_layout(spec, bodies, inferred)
-    rows, log_prior = structures(
-        layout,
-        spec.unknown,
-        options,
-        is_loaded=spec.normal_gravity > 0,
-        source=spec.source,
-    )
+    may_tie = options.probability["tie"] > 0
+    layout = block_layout(spec, bodies, inferred, may_tie=may_tie)
     trusted = history if freedom is None else without_isolated(history)
+    try:
+        rows, log_prior = structures(
+            layout,
+            spec.unknown,
+            options,
+            is_loaded=spec.normal_gravity > 0,
+            source=spec.source,
+        )
+    except ValueError as error:
+        if len(bodies) == 1:
+            raise
+        why = why_joined(spec, bodies, trusted, touching)
+        raise ValueError(f"{error}; {why}") from None
     poses = _poses(trusted, bodies)
     coordinates = Coordinates(
         layout=layout,

@@ -128,7 +128,11 @@ class Layout(NamedTuple):
 
 
 def block_layout(
-    spec: SceneSpec, bodies: tuple[int, ...], contact: tuple[str, ...] = ()
+    spec: SceneSpec,
+    bodies: tuple[int, ...],
+    contact: tuple[str, ...] = (),
+    *,
+    may_tie: bool = True,
 ) -> Layout:
     """Lay out the constraints that a block of bodies may have.
 
@@ -136,6 +140,8 @@ def block_layout(
         spec: the scene.
         bodies: indices of the block's bodies in the scene, ascending.
         contact: numbers of contact that are inferred.
+        may_tie: whether pairs have slots. Those of which the prior has none would only
+            make the block too large.
 
     Returns:
         The layout; its body indices count within the block.
@@ -173,7 +179,7 @@ def block_layout(
             for _ in range(spec.unknown.get(kind, 0)):
                 add(inferred, kind, i, WORLD, -1)
     for kind in JOINTS:
-        if spec.unknown.get(kind, 0):
+        if may_tie and spec.unknown.get(kind, 0):
             for i, j in itertools.combinations(movable, 2):
                 add(inferred, kind, i, j, -1)
     numbers = []

@@ -150,7 +150,7 @@ class OnlineBelief:
         check_history(spec, seen, "screen")
         self._blocks = [
             make_online_block(self._settings, bodies, self._empty)
-            for bodies in independent_blocks(spec, seen)[0]
+            for bodies in independent_blocks(spec, seen, is_complete=False)[0]
         ]
         groups: dict[object, list[int]] = {}
         for index, block in enumerate(self._blocks):

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 from numpy.lib.stride_tricks import sliding_window_view
 
 # Readings of which a running median is made, at most, and windows that a run has at
@@ -68,6 +69,32 @@ def pin_misfit(a: np.ndarray, b: np.ndarray, run: np.ndarray) -> Misfit:
     return _both(*both, run)
 
 
+def pin_distances(
+    a: np.ndarray, b: np.ndarray, scale: tuple[float, float], tolerance: float
+) -> Float[np.ndarray, " 2"]:
+    """How far from either centre the best common point is [m].
+
+    Of a pin it is asked to be near where readings do not tell: a body that does not
+    turn has the same motion wherever it is pinned.
+
+    Args:
+        a: poses of the one, `[reading, 3]` [m, m, rad].
+        b: poses of the other.
+        scale: how far from either centre a pin is expected to be [m].
+        tolerance: by how much readings may miss it [m].
+
+    Returns:
+        Zero without readings.
+    """
+    left, right = rotations(a[:, 2]), rotations(b[:, 2])
+    rows = np.concatenate([left, -right], axis=-1).reshape(-1, 4)
+    wanted = -(a[:, :2] - b[:, :2]).reshape(-1)
+    near = tolerance / np.repeat(np.asarray(scale), 2)
+    matrix = np.concatenate([rows, np.diag(near)])
+    best = np.linalg.lstsq(matrix, np.append(wanted, np.zeros(4)), rcond=None)[0]
+    return np.hypot(best[0::2], best[1::2])
+
+
 def slide_misfit(a: np.ndarray, b: np.ndarray, reach: float, run: np.ndarray) -> Misfit:
     """How far the one is from the best line fixed in the other, and from its angle.
 
@@ -109,7 +136,7 @@ def rod_range(a: np.ndarray, b: np.ndarray, run: np.ndarray) -> float:
     if len(a) == 0:
         return 0.0
     distance = np.hypot(*(a[:, :2] - b[:, :2]).T)
-    smooth = _running_median(distance[:, None], run)[0]
+    smooth = running_median(distance[:, None], run)[0]
     return float(min(np.ptp(distance), np.ptp(smooth)))
 
 
@@ -117,6 +144,32 @@ def rotations(angle: np.ndarray) -> np.ndarray:
     """Matrices that turn by angles, `[..., 2, 2]`."""
     cos, sin = np.cos(angle), np.sin(angle)
     return np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+
+
+def running_median(
+    values: np.ndarray, run: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Within each run, and where there was enough of it to take one.
+
+    Args:
+        values: `[reading, component]`.
+        run: which run each reading belongs to; readings of a run follow each other.
+
+    Returns:
+        Medians, readings as they are where there are too few, and where it is one.
+    """
+    out, is_smooth = np.array(values), np.zeros(len(values), bool)
+    edges = np.flatnonzero(np.diff(run) != 0) + 1
+    for rows in np.split(np.arange(len(values)), edges):
+        half = min(_WINDOW, len(rows) // _LEAST_WINDOWS) // 2
+        if half == 0:
+            continue
+        windows = sliding_window_view(values[rows], 2 * half + 1, axis=0)
+        # At the ends the window moves in as a whole.
+        begin = np.clip(np.arange(len(rows)) - half, 0, len(windows) - 1)
+        out[rows] = np.median(windows, axis=-1)[begin]
+        is_smooth[rows] = True
+    return out, is_smooth
 
 
 def _robust(
@@ -135,7 +188,7 @@ def _robust(
 
 def _both(raw: np.ndarray, robust: np.ndarray, run: np.ndarray) -> Misfit:
     """Of what both fits leave, `[reading, component]`."""
-    smooth, is_smooth = _running_median(robust, run)
+    smooth, is_smooth = running_median(robust, run)
     noise = 0.0
     if np.any(is_smooth):
         rest = np.abs(robust - smooth)[is_smooth]
@@ -145,21 +198,3 @@ def _both(raw: np.ndarray, robust: np.ndarray, run: np.ndarray) -> Misfit:
 
 def _size(missed: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.sum(missed**2, axis=1))))
-
-
-def _running_median(
-    values: np.ndarray, run: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Within each run, and where there was enough of it to take one."""
-    out, is_smooth = np.array(values), np.zeros(len(values), bool)
-    edges = np.flatnonzero(np.diff(run) != 0) + 1
-    for rows in np.split(np.arange(len(values)), edges):
-        half = min(_WINDOW, len(rows) // _LEAST_WINDOWS) // 2
-        if half == 0:
-            continue
-        windows = sliding_window_view(values[rows], 2 * half + 1, axis=0)
-        # At the ends the window moves in as a whole.
-        begin = np.clip(np.arange(len(rows)) - half, 0, len(windows) - 1)
-        out[rows] = np.median(windows, axis=-1)[begin]
-        is_smooth[rows] = True
-    return out, is_smooth
