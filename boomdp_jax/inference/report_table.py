@@ -41,6 +41,7 @@ _NOISE_UNITS = dict(
 )
 _LEAST_SHOWN = 0.001
 """Probability below which a structure is left out of the table (not of the object)."""
+_MOST_SHOWN = 10
 
 
 def format_report(report: dict, structures: dict[str, float], num_draws: int) -> str:
@@ -64,13 +65,7 @@ def format_report(report: dict, structures: dict[str, float], num_draws: int) ->
         for key, (title, units) in _BODY_TITLES.items():
             if key in body:
                 lines.append(f"{name:<16}{title:<20}{_quantity(body[key], units)}")
-    lines += ["", f"{'structure':<48}probability"]
-    for name, probability in structures.items():
-        if probability >= _LEAST_SHOWN:
-            lines.append(f"{name:<48}{probability:.3f}")
-    hidden = sum(value for value in structures.values() if value < _LEAST_SHOWN)
-    if hidden > 0:
-        lines.append(f"{'all others':<48}{hidden:.1g}")
+    lines += ["", *_structure_lines(structures)]
     for entry in report["structure"][:1]:
         if entry["constraints"]:
             lines += ["", "constraints of the most probable structure"]
@@ -105,6 +100,34 @@ def format_report(report: dict, structures: dict[str, float], num_draws: int) ->
     lines += _further_laws(diagnostics.get("residual", []))
     lines += note_lines(diagnostics.get("notes", []))
     return "\n".join(lines)
+
+
+def _structure_lines(structures: dict[str, float]) -> list[str]:
+    """The most probable structures, and what each constraint has in all of them.
+
+    Of many bodies of which little is known every combination is improbable; what there
+    is to know is how probable each constraint is, whatever else there is.
+    """
+    lines = [f"{'structure':<48}probability"]
+    shown = [name for name, p in structures.items() if p >= _LEAST_SHOWN]
+    lines += [f"{name:<47} {structures[name]:.3f}" for name in shown[:_MOST_SHOWN]]
+    hidden = sum(structures.values()) - sum(structures[x] for x in shown[:_MOST_SHOWN])
+    if len(shown) > _MOST_SHOWN:
+        others = f"all {len(structures) - _MOST_SHOWN} others"
+        lines.append(f"{others:<48}{hidden:.3f}")
+        each: dict[str, float] = {}
+        for name, probability in structures.items():
+            for part in name.split(" + ") if name != "free" else ():
+                each[part] = each.get(part, 0.0) + probability
+        lines += ["", f"{'constraint, whatever else there is':<48}probability"]
+        lines += [
+            f"{part:<47} {each[part]:.3f}"
+            for part in sorted(each, key=lambda part: -each[part])
+            if each[part] >= _LEAST_SHOWN
+        ]
+    elif len(shown) < len(structures) and hidden > 0:
+        lines.append(f"{'all others':<48}{hidden:.1g}")
+    return lines
 
 
 def verdict_line(ok: bool, reasons: list[str]) -> str:
