@@ -14,6 +14,9 @@ from typing import NamedTuple
 # environment, before JAX reads it.
 _PROGRAMS = Path(__file__).parents[1] / ".pytest_cache" / "xla"
 _MOST_DAYS = 14
+# Memory mappings, and memory [bytes], from which on a process lets go of what it
+# compiled.
+_MOST_MAPPINGS, _MOST_MEMORY = 15_000, 2.5e9
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_PROGRAMS))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 # XLA's older emitters, which jaxlib 0.10 still has, compile in two thirds of the time
@@ -53,18 +56,32 @@ def pytest_sessionstart() -> None:
                 path.unlink()
 
 
+def _has_room() -> bool:
+    """Whether more compiled programs may be kept; nobody knows but on Linux."""
+    try:
+        num_pages = int(Path("/proc/self/statm").read_text().split()[1])
+        num_mappings = Path("/proc/self/maps").read_bytes().count(b"\n")
+    except OSError:
+        return False
+    memory = num_pages * os.sysconf("SC_PAGE_SIZE")
+    return num_mappings < _MOST_MAPPINGS and memory < _MOST_MEMORY
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _drop_programs() -> Iterator[None]:
-    """Let go of a module's compiled programs when it is done.
+    """Let go of a module's compiled programs when it is done, if there are many.
 
     Each holds several memory mappings, of which a process may have 65,530 on Linux;
-    all tests together need more, and the compiler then crashes.
+    all tests together need more, and the compiler then crashes. But to let go takes a
+    second or two, and what is kept the next module need not compile again.
     """
     yield
-    jax.clear_caches()
-    side_by_side.forget_compiled()
     # What a command line in a test turned on.
     kept_traces.keep_traces(None)
+    if _has_room():
+        return
+    jax.clear_caches()
+    side_by_side.forget_compiled()
     gc.collect()
 
 
