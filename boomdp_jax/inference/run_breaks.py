@@ -25,6 +25,14 @@ _LEAST = 1e-6
 # and more than this share of how far a body goes in a row.
 _TIMES_OTHERS, _TIMES_CHANGE, _SHARE_OF_ROW = (6.0, 10.0), 2.0, 0.2
 _MOST_NAMED = 5
+_GLUED = (
+    "far more than it goes in a row; expected another 'episode' where another run "
+    "begins"
+)
+_LOST = (
+    "as if rows between them were missing; expected rows that follow one another, or "
+    "another 'episode' after each gap"
+)
 
 
 def run_break_reasons(spec: SceneSpec, history: History) -> list[str]:
@@ -39,22 +47,13 @@ def run_break_reasons(spec: SceneSpec, history: History) -> list[str]:
     """
     reasons = []
     for body in np.flatnonzero(~np.asarray(spec.is_static)):
-        position, angle = _gaps(history, int(body))
-        rows = np.flatnonzero((position > 0.0) | (angle > 0.0))
-        if len(rows):
-            reasons.append(
-                f"{_where(spec.names[body], rows, position, angle)}, far more than it "
-                "goes in a row; expected another 'episode' where another run begins"
-            )
-            continue
-        position, angle = _missing(history, int(body))
-        rows = np.flatnonzero((position > 0.0) | (angle > 0.0))
-        if len(rows):
-            reasons.append(
-                f"{_where(spec.names[body], rows, position, angle)}, as if rows "
-                "between them were missing; expected rows that follow one another, or "
-                "another 'episode' after each gap"
-            )
+        for find, text in ((_gaps, _GLUED), (_missing, _LOST)):
+            position, angle = find(history, int(body))
+            rows = np.flatnonzero((position > 0.0) | (angle > 0.0))
+            if len(rows):
+                where = _where(spec.names[body], rows, position, angle)
+                reasons.append(f"{where}, {text}")
+                break
     return reasons
 
 
