@@ -169,11 +169,13 @@ def _find_links(
         return links, []
     dropped, strayed, far = [], [], []
     screen = _Screen.of(spec, history)
+    joined = {frozenset(link[:2]) for link in links}
     for a, b in itertools.combinations(movable, 2):
-        if untold is not None and untold.has(a, b):
+        if frozenset((a, b)) in joined or (untold is not None and untold.has(a, b)):
             continue
         names = f"{spec.names[a]}-{spec.names[b]}"
-        tested = screen.test(a, b)
+        rests = untold is not None and bool(np.any(untold.is_at_rest[[a, b]]))
+        tested = screen.test(a, b, rests)
         if tested.is_tied:
             links.append(_Link(a, b, "may be tied by all that was read"))
         elif tested.far is not None:
@@ -238,11 +240,12 @@ class _Screen(NamedTuple):
             None if is_whole else bridged_tracks(history),
         )
 
-    def test(self, a: int, b: int) -> _Tested:
-        """Whether two bodies may be tied."""
+    def test(self, a: int, b: int, rests: bool) -> _Tested:
+        """Whether two bodies, one of which is at rest or not, may be tied."""
         two = [a, b]
         use = np.all(self.is_seen[:, two], axis=1)
-        tested = self._fits(a, b, self.state[use][:, two], self.run[use], 0.0)
+        pose, run = self.state[use][:, two], self.run[use]
+        tested = self._fits(a, b, pose, run, rests=rests)
         if not tested.is_tied or self.tracks is None:
             return tested
         pose, error = self.tracks.pose[:, two], self.tracks.error[:, two]
@@ -253,7 +256,7 @@ class _Screen(NamedTuple):
             arm = np.stack([np.ones(2), np.ones(2), _WIDEST_SPAN * reach], axis=1)
             off = np.sqrt(np.mean(np.sum((arm * error[whole]) ** 2, axis=(1, 2))))
             run = self.tracks.run[whole]
-            return self._fits(a, b, pose[whole], run, float(off))
+            return self._fits(a, b, pose[whole], run, rests=rests, off=float(off))
         if not np.any(use):
             seen = np.all(np.isfinite(pose[..., :2]), axis=(1, 2))
             if np.any(seen):
@@ -262,7 +265,14 @@ class _Screen(NamedTuple):
         return tested
 
     def _fits(
-        self, a: int, b: int, pose: np.ndarray, run: np.ndarray, off: float
+        self,
+        a: int,
+        b: int,
+        pose: np.ndarray,
+        run: np.ndarray,
+        *,
+        rests: bool,
+        off: float = 0.0,
     ) -> _Tested:
         """The same of poses `[reading, 2, 3]` that are off by so much [m]."""
         can_pin, can_rod, can_slide = _open_ties(self.spec)
@@ -270,8 +280,9 @@ class _Screen(NamedTuple):
         pair = pose[:, 0], pose[:, 1]
         misfit = pin_misfit(*pair, run)
         is_tied, far = can_pin and misfit.may_be(tolerance), None
-        if is_tied and len(pose):
-            # A door swings about its hinge, which may be anywhere in what stays still.
+        if is_tied and rests and len(pose):
+            # A door swings about its hinge, which may be in the world or anywhere in
+            # what stays still. Of two that move a tie that fits is no coincidence.
             scale = [
                 self.spec.bodies[i].reach + float(np.hypot(*each[:, :2].std(axis=0)))
                 for i, each in zip((a, b), pair, strict=True)

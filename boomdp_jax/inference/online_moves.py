@@ -61,12 +61,12 @@ def distinct_sample_size(particles: ParticleSet) -> FloatScalar:
         particles: with normalised log-weights.
     """
     num, dim = particles.z.shape
-    # Equal particles have equal sums, and others hardly ever have.
+    # Equal particles have equal sums, and others of their structure hardly ever have.
     factor = jnp.sqrt(jnp.arange(2.0, 2.0 + dim, dtype=particles.z.dtype))
-    name = jnp.sum(particles.z * factor[None], axis=1) + particles.structure
-    order = jnp.argsort(name)
-    is_new = jnp.diff(name[order], prepend=jnp.nan) != 0
-    copy = jnp.cumsum(is_new) - 1
+    name, structure = jnp.sum(particles.z * factor[None], axis=1), particles.structure
+    order = jnp.lexsort((name, structure))
+    is_new = (jnp.diff(name[order]) != 0) | (jnp.diff(structure[order]) != 0)
+    copy = jnp.cumsum(jnp.concatenate([jnp.zeros(1, bool), is_new]))
     weight = jnp.exp(particles.log_weight)[order]
     whole = jax.ops.segment_sum(weight, copy, num, indices_are_sorted=True)
     return jnp.sum(weight) ** 2 / jnp.sum(whole**2)

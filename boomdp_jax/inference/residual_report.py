@@ -81,7 +81,10 @@ def report_residuals(
             growth = spread.get(name)
             if growth is None or body in decisive:  # Such a law may well grow.
                 continue
-            if growth["p_value"] < _GROWTH_BY_CHANCE / max(num_bodies, 1):
+            # One gross error where it is slow, or readings that are all better than
+            # they are taken to be, make nothing too sure.
+            grows = growth["fast"] > max(1.0, growth["slow"])
+            if grows and growth["p_value"] < _GROWTH_BY_CHANCE / max(num_bodies, 1):
                 notes.append(
                     f"{name}: its readings err more the faster it moves, "
                     f"{growth['slow']:.2g} times as much as expected where it is slow "

@@ -23,7 +23,9 @@ _LEAST = 1e-6
 # number, an angle, the median lies lower in what noise makes of it than of two), or of
 # how much farther or less far than the one before a row goes, which is more than noise;
 # and more than this share of how far a body goes in a row.
-_TIMES_OTHERS, _TIMES_CHANGE, _SHARE_OF_ROW = (6.0, 10.0), 2.0, 0.2
+_TIMES_OTHERS, _TIMES_CHANGE, _SHARE_OF_ROW = (6.0, 10.0), (2.0, 4.0), 0.2
+# Last digits of readings that rounding leaves of a gap, at most.
+_DIGITS = 3.0
 _MOST_NAMED = 5
 _GLUED = (
     "far more than it goes in a row; expected another 'episode' where another run "
@@ -98,7 +100,9 @@ def _missing(
     """
     first, last, goes_on = _poses(history, body)
     found = []
-    for channels, times in zip((slice(0, 2), slice(2, 3)), _TIMES_OTHERS, strict=True):
+    for channels, others, by_change in zip(
+        (slice(0, 2), slice(2, 3)), _TIMES_OTHERS, _TIMES_CHANGE, strict=True
+    ):
         moved = _difference(last, first)[:, channels]
         gap = _difference(first, np.roll(last, 1, axis=0))[:, channels]
         gap[~goes_on] = np.nan
@@ -113,16 +117,18 @@ def _missing(
             found.append(np.zeros(len(gap)))
             continue
         if is_equal.sum() >= 0.5 * is_read.sum():
-            least = _TIMES_CHANGE * np.median(change)
+            least = by_change * np.median(change)
             is_smooth = np.ones(len(gap), bool)
         else:
-            least = times * np.median(size[is_read])
+            least = others * np.median(size[is_read])
             # A reading that is wrong shows in how far the rows beside it go.
             other = np.roll(earlier, 1, axis=0)
             other[~(goes_on & np.roll(goes_on, 1))] = np.nan
             is_smooth = _is_between(moved, earlier, later, size)
             is_smooth &= _is_between(earlier, other, moved, size)
-        least = max(_LEAST, least, _SHARE_OF_ROW * np.nanmedian(length))
+        rounding = _DIGITS * _last_digit(np.concatenate([first, last])[:, channels])
+        usual = _SHARE_OF_ROW * np.nanmedian(length)
+        least = max(_LEAST, least, usual, rounding)
         with np.errstate(invalid="ignore"):
             found.append(np.where(is_smooth & (size > least), size, 0.0))
     return found[0], found[1]
@@ -132,11 +138,23 @@ def _is_between(
     moved: np.ndarray, earlier: np.ndarray, later: np.ndarray, size: np.ndarray
 ) -> np.ndarray:
     """Whether a row goes about as far as its neighbours do, where they were read."""
-    both = np.stack(
-        [np.where(np.isnan(each), moved, each) for each in (earlier, later)]
-    )
+    both = np.stack([earlier, later])
+    is_read = ~np.isnan(both)
+    num = is_read.sum(axis=0)
+    mean = np.where(is_read, both, 0.0).sum(axis=0) / np.maximum(num, 1)
+    mean = np.where(num > 0, mean, moved)
     with np.errstate(invalid="ignore"):
-        return np.linalg.norm(moved - both.mean(axis=0), axis=1) < 0.5 * size
+        return np.linalg.norm(moved - mean, axis=1) < 0.5 * size
+
+
+def _last_digit(values: np.ndarray) -> float:
+    """The least by which two readings of a channel differ, the largest of channels."""
+    least = 0.0
+    for column in values.T:
+        steps = np.diff(np.unique(column[~np.isnan(column)]))
+        steps = steps[steps > _LEAST]
+        least = max(least, float(steps.min(initial=np.inf)) if len(steps) else 0.0)
+    return least
 
 
 def _difference(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -168,6 +186,7 @@ def _gaps(
                 (gap > _TIMES * usual)
                 & (distance(last, before) > (_TIMES - _GOES_ON) * usual)
                 & (moved <= _GOES_ON * usual)
+                & ~(np.roll(moved, 1) > _GOES_ON * usual)
                 & (distance(after, last) <= _GOES_ON * usual)
             )
         found.append(np.where(is_gap, gap, 0.0))

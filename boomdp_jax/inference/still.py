@@ -37,6 +37,9 @@ def bodies_let_be(
         history: its readings.
         touching: what may have touched; None: nothing collides.
     """
+    # What acts where nothing was commanded does not move it, which tells of mass.
+    if "actuator.bias" in spec.unknown_numbers:
+        return ()
     is_pushed, is_still = _pushed_and_still(spec, history)
     is_let_be = ~is_pushed & is_still
     if touching is not None:
@@ -133,14 +136,23 @@ def _pushed_and_still(
     action = np.asarray(history.action)[rows]
     is_pushed = np.any(action != 0.0, axis=(0, 2)) | np.asarray(spec.is_static)
     state = np.where(history.state_mask, history.state, np.nan)[rows]
+    last = np.where(history.next_state_mask, history.next_state, np.nan)[rows]
     starts = np.flatnonzero(~np.asarray(history.is_chained)[rows])
-    runs = [run for run in np.split(state, starts) if len(run)]
+    runs = [
+        np.concatenate([run, end[-1:]])
+        for run, end in zip(
+            np.split(state, starts), np.split(last, starts), strict=True
+        )
+        if len(run)
+    ]
     is_still = [all(_is_still(run[:, body]) for run in runs) for body in range(num)]
     return is_pushed, np.array(is_still)
 
 
 def _is_still(run: np.ndarray) -> bool:
     """Whether readings `[time, 6]` of one run are those of a body at rest."""
+    if np.isnan(run[-1, :3]).any():
+        run = run[:-1]
     if len(run) < _FEWEST or np.isnan(run[:, :3]).any():
         return False
     half = len(run) // 2
@@ -153,6 +165,11 @@ def _is_still(run: np.ndarray) -> bool:
     change = np.abs(change - np.median(change, axis=0))
     spread = SD_OF_MEDIAN * np.median(change, axis=0) / np.sqrt(2.0)
     has_moved = np.abs(pose) > _NUM_ERRORS * np.sqrt(2.0 / half) * spread
+    # What a gross error leaves alone, and a body that goes and comes back does not.
+    place = np.column_stack([run[:, :2], angle])
+    three = np.median(np.lib.stride_tricks.sliding_window_view(place, 3, 0), axis=-1)
+    away = np.abs(three - np.median(place, axis=0)).max(axis=0)
+    has_moved |= away > _NUM_ERRORS * spread
     twist = run[:, 3:]
     twist = twist[:, ~np.isnan(twist).any(axis=0)]
     limit = _NUM_ERRORS * twist.std(axis=0) / np.sqrt(len(run))

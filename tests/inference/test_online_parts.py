@@ -245,6 +245,16 @@ def test_particles_that_are_all_different_count_by_their_weights():
     assert found == pytest.approx(float(effective_sample_size(cloud.log_weight)))
 
 
+def test_particles_that_lie_close_are_not_copies():
+    """In single precision, where a structure's number has no digits left for them."""
+    rng = np.random.default_rng(2)
+    z = (1e-4 * rng.normal(size=(400, 9))).astype(np.float32)
+    with jax.enable_x64(False):
+        equal = np.full(400, -np.log(400.0), np.float32)
+        cloud = particle_set(np.full(400, 4000), z, equal)
+        assert float(distinct_sample_size(cloud)) == pytest.approx(400.0, rel=0.01)
+
+
 @pytest.mark.slow
 def test_the_mixture_is_fitted_to_the_particles_of_each_structure():
     target, design, data = make_problem()

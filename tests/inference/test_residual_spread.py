@@ -86,3 +86,10 @@ def test_a_note_says_by_how_much(no_type_checks):
     calm = spread_growth(*random_rows(0, 0.0), 0.2)
     result = result._replace(residual=check._replace(growth=(calm,)))
     assert report_residuals(box_scene(), [result])[2] == []
+    # Less than was expected everywhere, and one gross error while it is slow.
+    for odd in (
+        growth._replace(slow=0.006, fast=0.013),
+        growth._replace(slow=3.8, fast=1.7),
+    ):
+        result = result._replace(residual=check._replace(growth=(odd,)))
+        assert report_residuals(box_scene(), [result])[2] == []

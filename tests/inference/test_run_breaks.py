@@ -83,3 +83,26 @@ def test_rows_that_were_lost_on_the_way_are_noticed(seed, is_chained):
 def test_runs_that_begin_anew_after_each_gap_are_in_order(seed, is_chained):
     history, _ = with_rows_lost(seed, is_chained=is_chained, is_told=True)
     assert run_break_reasons(box_scene(), history) == []
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("what", ["rounded", "read twice now and then", "gross errors"])
+def test_what_is_no_gap_is_not_taken_for_lost_rows(seed, what):
+    rng = np.random.default_rng(seed)
+    history = free_box(rng, 60, is_chained=False)
+    state, last = np.array(history.state), np.array(history.next_state)
+    if what == "rounded":
+        digit = np.array([5e-3, 5e-3, np.pi / 180, 0.02, 0.02, 0.02])
+        state, last = (digit * np.round(part / digit) for part in (state, last))
+    elif what == "read twice now and then":
+        state = np.zeros_like(state) + NOISE * rng.standard_normal(state.shape)
+        last = NOISE * rng.standard_normal(state.shape)
+        same = rng.random(59) < 0.7
+        state[1:][same] = last[:-1][same]
+    else:
+        # Both readings of one row would be a run of their own.
+        rows = 3 * rng.choice(20, size=2, replace=False)
+        for part, row in zip((state, last), rows, strict=True):
+            part[row, 0, :2] += 0.3
+    history = make_history(state, history.action, last, 0.02)
+    assert run_break_reasons(box_scene(), history) == []

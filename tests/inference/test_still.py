@@ -92,6 +92,22 @@ def test_one_that_swings_to_and_fro_is_not(rate, seed):
     assert still_notes(box_scene(), history) == []
 
 
+@pytest.mark.parametrize("what", ["goes at last", "goes and comes back"])
+@pytest.mark.parametrize("seed", range(5))
+def test_one_that_moves_for_a_reading_or_two_is_not(what, seed):
+    """Seen by a camera, which reads no velocities."""
+    run = np.zeros((NUM + 1, 6))
+    run[..., 3:] = np.nan
+    if what == "goes at last":
+        run[-1, 0] += 0.5
+    else:
+        run[12:14, 0] += 0.02
+    run += NOISE * np.random.default_rng(seed).standard_normal(run.shape)
+    state = run[:, None]
+    history = make_history(state[:-1], np.zeros((NUM, 1, 3)), state[1:], DT)
+    assert still_notes(box_scene(), history) == []
+
+
 def test_on_a_slope_rest_does_tell_something():
     shape = {"type": "box", "half_extents": SIZE}
     content = {"schema": "planar-scene-1", "dt": DT, "gravity": [0.0, -1.0]}
@@ -128,6 +144,13 @@ def test_what_is_let_be_is_left_out():
 def test_what_may_have_been_touched_is_not_let_be():
     touching = Touching(np.ones((1, 1), bool), {})
     assert bodies_let_be(OPEN, recorded(), touching) == ()
+
+
+def test_what_may_be_pulled_at_all_times_is_not_let_be():
+    content = OPEN.to_dict()
+    content["unknown"]["actuator"] = ["bias"]
+    pulled = scene_spec_from_dict(content)
+    assert bodies_let_be(pulled, recorded(), None) == ()
 
 
 def test_a_body_whose_readings_are_left_out_is_named_once():

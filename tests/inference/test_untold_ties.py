@@ -203,6 +203,29 @@ def test_a_pin_of_bodies_that_hardly_turn_is_looked_for_near_them(seed):
     assert independent_blocks(scene(2), recorded(state, seed=seed))[0] == [(0, 1)]
 
 
+def test_of_two_that_move_a_far_tie_that_fits_is_kept():
+    """Two discs welded a metre apart, of which the one is five centimetres wide."""
+    shape = {"type": "circle", "radius": 0.05}
+    content = scene(2, {"revolute": 1, "weld": 1}).to_dict()
+    for body in content["bodies"]:
+        body["shape"] = shape
+    spec = scene_spec_from_dict(content)
+    state = places(2, 0.0)
+    state[:, 0, :3] = 0.05 * np.sin(
+        np.outer(np.arange(NUM + 1), [0.3, 0.2, 0.25]) + np.arange(3.0)[None]
+    )
+    state[:, 1, 2] = state[:, 0, 2]
+    state[:, 1, :2] = state[:, 0, :2] + rotations(state[:, 0, 2]) @ [1.0, 0.0]
+    state[..., 3:] = np.nan
+    assert independent_blocks(spec, recorded(state))[0] == [(0, 1)]
+
+
+def test_what_the_scene_ties_is_not_said_to_be_apart():
+    joint = {"type": "revolute", "a": "chair", "b": "sofa"}
+    known = scene(2, constraints=[joint | {"anchor_a": [0, 0], "anchor_b": [0, 0]}])
+    assert independent_blocks(known, recorded(all_moved(2))) == ([(0, 1)], [])
+
+
 def test_without_rows_the_prior_keeps_its_ties():
     none = np.zeros((0, 2, 6))
     empty = make_history(none, none[..., :3], none, DT, capacity=4)
