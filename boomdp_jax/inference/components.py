@@ -68,12 +68,13 @@ def independent_blocks(
     for the whole scene. Known constraints tie bodies for certain.
 
     A pair that may be tied by an unknown pin (or a weld, which is a pin as well) is
-    tested by the least-squares misfit of the best common anchors, and by how far those
-    are from the centres; one that may be tied by an unknown rod, by how much the
-    distance of its centres varies beyond what the outlines' radii allow; by an unknown
-    drawer, by how far the one leaves a line fixed in the other, or its angle. Where the
-    two were read in turn, poses between readings are tested as well (`tie_tracks`);
-    where an angle was never read, whether the centres are too far apart for a pin.
+    tested by the least-squares misfit of the best common anchors, and where one of the
+    two is at rest by how far those are from the centres; one that may be tied by an
+    unknown rod, by how much the distance of its centres varies beyond what the
+    outlines' radii allow; by an unknown drawer, by how far the one leaves a line fixed
+    in the other, or its angle. Where the two were read in turn, poses between readings
+    are tested as well (`tie_tracks`); where an angle was never read, whether the
+    centres are too far apart for a pin.
 
     No pair is tied where the prior has no ties, and none of which no reading could tell
     a tie (`untold_ties`).
