@@ -28,8 +28,6 @@ TIE_TOLERANCE = 0.03
 # Without angles pins are looked for up to so many times as far from a centre as its
 # outline reaches: a hinge beside a door, and room for doubt.
 _WIDEST_SPAN = 2.0
-
-
 # Sds, of where a pin is expected about a centre, beyond which there is none: of two
 # numbers one in 3,000 is farther off.
 _FARTHEST_PIN = 4.0

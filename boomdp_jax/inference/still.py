@@ -5,20 +5,15 @@ from collections.abc import Collection
 import numpy as np
 
 from boomdp_jax.core.history import History
-from boomdp_jax.inference.outliers import SD_OF_MEDIAN
+from boomdp_jax.inference.at_rest import is_at_rest
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.prior import read_prior
 from boomdp_jax.inference.touching import Touching
 from boomdp_jax.physics.params import WORLD
 from boomdp_jax.physics.scene_spec import SceneSpec
 
-# Readings of a run that it takes to say that a body did not move, and standard errors
-# by which its halves may differ, and velocities from zero.
-_FEWEST, _NUM_ERRORS = 6, 6.0
-# Readings of a body at rest differ from one to the next as they do from any other; of
-# one that moves they differ more from those far off. By how many standard errors, and
-# how closely changes of place may follow the velocities that were read.
-_NUM_ALIKE, _LEAST_TOGETHER = 4.5, 0.5
+# Readings that it takes to say that a body did not move.
+_FEWEST = 6
 # By how much the probability of a pin may differ from the prior's where nothing tells.
 _MOST_GAP = 0.15
 
@@ -135,67 +130,5 @@ def _pushed_and_still(
         return np.ones(num, bool), np.zeros(num, bool)
     action = np.asarray(history.action)[rows]
     is_pushed = np.any(action != 0.0, axis=(0, 2)) | np.asarray(spec.is_static)
-    state = np.where(history.state_mask, history.state, np.nan)[rows]
-    last = np.where(history.next_state_mask, history.next_state, np.nan)[rows]
-    starts = np.flatnonzero(~np.asarray(history.is_chained)[rows])
-    runs = [
-        np.concatenate([run, end[-1:]])
-        for run, end in zip(
-            np.split(state, starts), np.split(last, starts), strict=True
-        )
-        if len(run)
-    ]
-    is_still = [all(_is_still(run[:, body]) for run in runs) for body in range(num)]
+    is_still = [is_at_rest(spec, history, body, _FEWEST) for body in range(num)]
     return is_pushed, np.array(is_still)
-
-
-def _is_still(run: np.ndarray) -> bool:
-    """Whether readings `[time, 6]` of one run are those of a body at rest."""
-    if np.isnan(run[-1, :3]).any():
-        run = run[:-1]
-    if len(run) < _FEWEST or np.isnan(run[:, :3]).any():
-        return False
-    half = len(run) // 2
-    first, last = run[:half], run[-half:]
-    pose = last[:, :3].mean(axis=0) - first[:, :3].mean(axis=0)
-    angle = np.angle(np.exp(1j * (run[:, 2] - run[0, 2])))
-    pose[2] = angle[-half:].mean() - angle[:half].mean()
-    # Of the readings, not of the motion: it shows from one to the next.
-    change = np.diff(np.column_stack([run[:, :2], angle]), axis=0)
-    change = np.abs(change - np.median(change, axis=0))
-    spread = SD_OF_MEDIAN * np.median(change, axis=0) / np.sqrt(2.0)
-    has_moved = np.abs(pose) > _NUM_ERRORS * np.sqrt(2.0 / half) * spread
-    # What a gross error leaves alone, and a body that goes and comes back does not.
-    place = np.column_stack([run[:, :2], angle])
-    three = np.median(np.lib.stride_tricks.sliding_window_view(place, 3, 0), axis=-1)
-    away = np.abs(three - np.median(place, axis=0)).max(axis=0)
-    has_moved |= away > _NUM_ERRORS * spread
-    twist = run[:, 3:]
-    twist = twist[:, ~np.isnan(twist).any(axis=0)]
-    limit = _NUM_ERRORS * twist.std(axis=0) / np.sqrt(len(run))
-    is_moving = np.abs(twist.mean(axis=0)) > limit
-    return not (np.any(has_moved) or np.any(is_moving) or _goes_to_and_fro(run, angle))
-
-
-def _goes_to_and_fro(run: np.ndarray, angle: np.ndarray) -> bool:
-    """Whether readings of one run are those of a body that comes back, as on a pin."""
-    pose = np.column_stack([run[:, :2], angle])
-    change, num = np.diff(pose, axis=0), len(run)
-    # Mean square successive difference over the variance, two for white noise: von
-    # Neumann (1941), Distribution of the ratio of the mean square successive difference
-    # to the variance.
-    size = num * pose.var(axis=0)
-    ratio = np.sum(change**2, axis=0) / np.where(size > 0, size, 1.0)
-    error = 2.0 * np.sqrt((num - 2.0) / (num**2 - 1.0))
-    if np.any((size > 0) & (ratio < 2.0 - _NUM_ALIKE * error)):
-        return True
-    # What swings fast is as far off at the next reading as at any; but then it has the
-    # velocity that takes it there.
-    middle = 0.5 * (run[1:, 3:] + run[:-1, 3:])
-    least = max(_LEAST_TOGETHER, _NUM_ALIKE / np.sqrt(num))
-    for moved, speed in zip(change.T, middle.T, strict=True):
-        moved, speed = moved - moved.mean(), speed - speed.mean()
-        length = np.sqrt(np.sum(moved**2) * np.sum(speed**2))
-        if length > 0 and np.sum(moved * speed) > least * length:
-            return True
-    return False

@@ -6,21 +6,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from boomdp_jax.core.history import History
-from boomdp_jax.inference.outliers import SD_OF_MEDIAN
-from boomdp_jax.inference.prior import read_prior
-from boomdp_jax.inference.tie_misfit import running_median
+from boomdp_jax.inference.at_rest import is_at_rest
 from boomdp_jax.physics.scene_spec import SceneSpec
-
-# Readings from which their noise is told, and sds of it that one at rest may be off by.
-_FEWEST, _NUM_SDS = 6, 5.0
-# Readings of which the noise is taken for twice as large as it seems.
-_FEW = 10.0
-# Of a median over a mean, standard errors of normal noise.
-_ERROR_OF_MEDIAN = 1.2533
-# Noise [m] above which what shakes cannot be told from what rests.
-_COARSEST = 0.03
-# What rounding leaves of a difference of readings of one pose [m, rad, m/s, rad/s].
-_ROUNDING = 1e-5
 
 
 class Untold(NamedTuple):
@@ -63,12 +50,12 @@ def find_untold(spec: SceneSpec, history: History) -> Untold:
     episode = np.asarray(history.episode)[rows]
     runs = [np.any(seen[episode == run], axis=0) for run in np.unique(episode)]
     together = np.any([np.outer(run, run) for run in runs], axis=0)
-    is_at_rest = none
+    rests = none
     # On a slope rest tells that something holds a body.
     if not np.any(np.asarray(spec.scene.gravity) != 0.0):
-        is_at_rest = np.array([_is_at_rest(spec, history, i) for i in range(num)])
-        is_at_rest &= _may_rest(spec, np.asarray(history.action)[rows])
-    return Untold(is_at_rest, ~np.any(runs, axis=0), together)
+        rests = np.array([is_at_rest(spec, history, i) for i in range(num)])
+        rests &= _may_rest(spec, np.asarray(history.action)[rows])
+    return Untold(rests, ~np.any(runs, axis=0), together)
 
 
 def untold_notes(
@@ -130,80 +117,3 @@ def _may_rest(spec: SceneSpec, action: np.ndarray) -> Bool[np.ndarray, " body"]:
         for constraint in spec.constraints:
             has_floor[constraint.body_a] |= constraint.kind == "ground"
     return has_floor | ~np.any(action != 0.0, axis=(0, 2))
-
-
-def _is_at_rest(spec: SceneSpec, history: History, body: int) -> bool:
-    """Whether all readings of a body are of one place, and of no velocity."""
-    rows = np.asarray(history.mask)
-    episode = np.asarray(history.episode)[rows]
-    parts = []
-    for values, mask in (
-        (history.state, history.state_mask),
-        (history.next_state, history.next_state_mask),
-    ):
-        array = np.asarray(values, float)[rows, body]
-        parts.append(np.where(np.asarray(mask)[rows, body], array, np.nan))
-    # The end of a row is the start of the next one: one reading, not two.
-    is_last = np.append(~np.asarray(history.is_chained)[rows][1:], True)
-    parts[1][~is_last] = np.nan
-    reading = np.stack(parts, axis=1).reshape(-1, 6)
-    run = np.repeat(episode, 2)
-    if not np.any(np.all(np.isfinite(reading[:, :2]), axis=-1)):
-        return False
-    scale = read_prior(spec.prior, spec.source).noise
-    groups = ("position", "position", "angle", "velocity", "velocity", "spin")
-    unit = (1.0, 1.0, spec.bodies[body].reach)
-    for channel, group in enumerate(groups):
-        use = np.isfinite(reading[:, channel])
-        value, of = reading[use, channel], run[use]
-        if len(value) == 0:
-            continue
-        if group == "angle":
-            value = np.angle(np.exp(1j * (value - value[0])))
-        middle = np.median(value) if channel < 3 else 0.0
-        sd, digit = _noise(value, of, float(scale[group]))
-        if channel < 3 and sd * unit[channel] > _COARSEST:
-            return False
-        if not _stays(value - middle, of, sd, digit):
-            return False
-    return int(np.sum(np.isfinite(reading[:, 0]))) > 1
-
-
-def _noise(value: np.ndarray, run: np.ndarray, prior: float) -> tuple[float, float]:
-    """Of single readings, by how much one differs from the next of its run.
-
-    And their last digit: the least by which two differ.
-    """
-    change = np.diff(value)[run[1:] == run[:-1]]
-    if len(change) < _FEWEST - 1:
-        return prior, 0.0
-    size = np.abs(change)
-    off = np.abs(change - np.median(change))
-    sd = SD_OF_MEDIAN * float(np.median(off)) / np.sqrt(2.0)
-    digit = float(np.min(size, where=size > 0.0, initial=np.max(size)))
-    # Few readings say little of noise.
-    return sd * (1.0 + _FEW / len(value)), digit
-
-
-def _stays(off: np.ndarray, run: np.ndarray, sd: float, digit: float) -> bool:
-    """Whether what was read, off what is expected at rest, is noise in each run.
-
-    Medians of a few readings in a row, from which gross errors have gone, find what
-    came back; halves of runs find what is slow.
-    """
-    least = digit + _ROUNDING
-    smooth = running_median(off[:, None], run)[0]
-    if np.max(np.abs(smooth)) > _NUM_SDS * sd + least:
-        return False
-    for mine in np.split(off, np.flatnonzero(np.diff(run) != 0) + 1):
-        if len(mine) < _FEWEST:
-            continue
-        half = len(mine) // 2
-        error = _NUM_SDS * _ERROR_OF_MEDIAN * sd
-        moved = abs(np.median(mine[-half:]) - np.median(mine[:half]))
-        if moved > error * np.sqrt(2.0 / half) + least:
-            return False
-        # Of all runs together the median is zero, of each one it is close to that.
-        if abs(np.median(mine)) > error * np.sqrt(2.0 / len(mine)) + least:
-            return False
-    return True
