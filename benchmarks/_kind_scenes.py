@@ -205,9 +205,10 @@ def lone_params(params: Params, body: int) -> Params:
             if name in ("body_a", "body_b"):
                 fields[name] = jnp.full((num, 1), 0 if name == "body_a" else WORLD)
                 continue
+            if value is None and empty is None:
+                continue  # What the law has by itself, which is not zero.
             if empty is None:
-                pair = (2,) if name in ("load_shift", "stance_scale") else ()
-                empty = np.zeros((1, 1, *pair))
+                empty = np.zeros((1, 1, *value.shape[3:]))
             empty = np.asarray(empty)
             whole = np.broadcast_to(empty, (num, *empty.shape))
             if value is not None and is_joint and len(owner):

@@ -12,6 +12,7 @@ objects say much: a new kind fits its first object.
 import numpy as np
 
 from boomdp_jax.inference.concentration import draw_concentration
+from boomdp_jax.inference.kind_particles import regather_kinds, split_or_merge_kinds
 from boomdp_jax.inference.kind_shift import shift_kinds
 from boomdp_jax.inference.kind_state import (
     KindData,
@@ -22,16 +23,18 @@ from boomdp_jax.inference.kind_state import (
     log_label,
     log_structure,
 )
-from boomdp_jax.inference.kind_structures import restructure_kinds
 from boomdp_jax.inference.object_moves import Kinds, ObjectMove, draw_index
 
 # A nudge every so often, and how far it goes.
 _NUDGE_EVERY, _NUDGE_SHARE = 3, 0.4
-# Sweeps between proposals of new structures for a whole kind: they cost as much as the
-# rest of a sweep.
-_RESTRUCTURE_EVERY = 3
+# Sweeps between draws of whole kinds afresh, which cost as much as the rest of one.
+_REGATHER_EVERY = 3
+# Of each kind, or pair of kinds, that is drawn afresh.
+_NUM_PARTICLES = 16
+# Likelihoods of one object that are worked out at once: fewer hardly take less time.
+_NUM_POINTS = 512
 # Common shifts of all objects of a kind in each sweep.
-_NUM_SHIFTS = 2
+_NUM_SHIFTS = 6
 
 
 def sweep_collapsed(
@@ -39,6 +42,7 @@ def sweep_collapsed(
     data: KindData,
     state: KindState,
     number: int,
+    log_pair: np.ndarray,
     *,
     fixed_concentration: bool = False,
 ) -> tuple[KindState, np.ndarray]:
@@ -49,6 +53,7 @@ def sweep_collapsed(
         data: what is known of the objects.
         state: of all chains.
         number: of the sweep; every few sweeps coordinates move a little instead.
+        log_pair: `kind_pairs.log_pairs` of the objects.
         fixed_concentration: whether to leave the concentration as it is.
 
     Returns:
@@ -57,9 +62,11 @@ def sweep_collapsed(
     state = compact(rng, data, state)
     for _ in range(_NUM_SHIFTS):
         state = shift_kinds(rng, data, state)
+    split_or_merge_kinds(rng, data, state, _NUM_PARTICLES, log_pair)
+    if number % _REGATHER_EVERY == 0:
+        regather_kinds(rng, data, state, _NUM_PARTICLES)
+    # Not before: the spreads are integrated out of all these.
     draw_spreads(rng, data, state)
-    if number % _RESTRUCTURE_EVERY == 0:
-        restructure_kinds(rng, data, state)
     accepted = np.ones(data.num_objects)
     is_nudge = number % _NUDGE_EVERY == _NUDGE_EVERY - 1
     for i in rng.permutation(data.num_objects).tolist():
@@ -132,9 +139,9 @@ def _move(rng, data: KindData, state: KindState, i, new_slot, is_nudge) -> float
     spread = state.spread[..., :dim]
     mean, variance = part.predictive(*sums, spread)
 
-    def log_exact(kind: np.ndarray, z: np.ndarray) -> np.ndarray:
-        of_kind = (x[chains, kind] for x in sums)
-        return part.log_predictive(z, *of_kind, spread[chains, kind])
+    def log_exact(chain: np.ndarray, kind: np.ndarray, z: np.ndarray) -> np.ndarray:
+        of_kind = (x[chain, kind] for x in sums)
+        return part.log_predictive(z, *of_kind, spread[chain, kind])
 
     kinds = Kinds(
         log_weight, log_structure(data, tallies.structure), mean, variance, log_exact
@@ -147,24 +154,54 @@ def _move(rng, data: KindData, state: KindState, i, new_slot, is_nudge) -> float
     if is_nudge:
         choice, before = move.nudge(rng, *old, _NUDGE_SHARE)
     else:
-        choice, before = move.draw(rng), move.log_ratio(*old)
+        choice = move.draw(rng, num_tries(len(chains)))
+        before = move.log_ratio(chains, *old)
     return decide(rng, data, state, i, choice, before)
 
 
+def num_tries(num_chains: int) -> int:
+    """Proposals of each chain that cost about as much as one."""
+    return max(1, _NUM_POINTS // num_chains)
+
+
 def decide(rng, data: KindData, state: KindState, i: int, choice, before) -> float:
-    """Accept or refuse proposals of an object in all chains; the share accepted."""
-    chains = np.arange(len(choice.kind))
-    new = data.log_likelihood(np.full(len(chains), i), choice.structure, choice.z)
-    log_odds = new + choice.log_ratio - state.log_likelihood[:, i] - before
-    is_taken = choice.is_inside & np.isfinite(new)
-    is_taken &= np.log(1.0 - rng.random(len(chains))) < np.nan_to_num(
-        log_odds, nan=-np.inf
-    )
-    state.kind[is_taken, i] = choice.kind[is_taken]
-    state.structure[is_taken, i] = choice.structure[is_taken]
-    state.z[is_taken, i] = choice.z[is_taken]
-    state.log_likelihood[is_taken, i] = new[is_taken]
-    return float(is_taken.mean())
+    """Take one of several proposals of an object, or keep what each chain has.
+
+    With several each is taken in proportion to target over proposal, and so is the old
+    one (Tjelmeland (2004), Using all Metropolis-Hastings proposals to estimate mean
+    values, section 3): they must not depend on where the chain is. A single one is
+    accepted or refused.
+
+    Args:
+        rng: source of randomness.
+        data: what is known of the objects.
+        state: of all chains, changed in place.
+        i: the object.
+        choice: the same number of proposals of each chain.
+        before: the old points' log of target over proposal, without the likelihood.
+
+    Returns:
+        The share of chains in which something was taken.
+    """
+    num_chains = len(before)
+    index = np.full(len(choice.kind), i)
+    new = data.log_likelihood(index, choice.structure, choice.z)
+    weight = np.where(choice.is_inside, new + choice.log_ratio, -np.inf)
+    weight = np.nan_to_num(weight, nan=-np.inf, posinf=-np.inf)
+    weight = weight.reshape(num_chains, -1)
+    old = state.log_likelihood[:, i] + before
+    if weight.shape[1] == 1:
+        gain = np.minimum(weight[:, 0] - old, 0.0)
+        taken = np.where(np.log(1.0 - rng.random(num_chains)) < gain, 0, 1)
+    else:
+        taken = draw_index(rng, np.append(weight, old[:, None], axis=1))
+    chains = np.flatnonzero(taken < weight.shape[1])
+    place = chains * weight.shape[1] + taken[chains]
+    state.kind[chains, i] = choice.kind[place]
+    state.structure[chains, i] = choice.structure[place]
+    state.z[chains, i] = choice.z[place]
+    state.log_likelihood[chains, i] = new[place]
+    return len(chains) / num_chains
 
 
 def fill_in(

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from boomdp_jax.inference.collapsed_gibbs import fill_in, sweep_collapsed
+from boomdp_jax.inference.kind_pairs import log_pairs
 from boomdp_jax.inference.kind_state import (
     KindData,
     KindState,
@@ -81,6 +82,7 @@ def run_kind_chains(
         state.concentration[:] = before_concentration
     kept: dict[str, list] = {name: [] for name in KindDraws._fields[:6]}
     accepted = np.zeros(data.num_objects)
+    log_pair = log_pairs(data)
     for number in range(settings.num_warmup + settings.num_samples):
         if settings.sampler == "sticks":
             state, share = sweep_sticks(
@@ -92,7 +94,7 @@ def run_kind_chains(
             )
         else:
             state, share = sweep_collapsed(
-                rng, data, state, number, fixed_concentration=is_fixed
+                rng, data, state, number, log_pair, fixed_concentration=is_fixed
             )
         if number < settings.num_warmup:
             continue

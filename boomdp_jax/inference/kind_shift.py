@@ -20,7 +20,7 @@ from boomdp_jax.inference.kind_state import (
 )
 
 # How far shifts go, in sd of what is left open.
-_SHARES = (0.3, 1.0)
+_SHARES = (0.1, 0.2, 0.4, 0.8)
 
 
 def shift_kinds(

@@ -35,14 +35,16 @@ class Kinds(NamedTuple):
     mean: np.ndarray
     """Of a normal distribution near the kind's coordinates, `[chain, kind, dim]`."""
     variance: np.ndarray
-    log_exact: Callable[[np.ndarray, np.ndarray], np.ndarray]
-    """Exact log-density of each coordinate, `[chain, dim]`, from a kind of each chain
-    and coordinates `[chain, dim]`."""
+    log_exact: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+    """Exact log-density of each coordinate, `[point, dim]`, from chains, kinds and
+    coordinates of points."""
 
 
 class Choice(NamedTuple):
-    """A kind, a structure and coordinates in each chain; leading axis `chain`."""
+    """Kinds, structures and coordinates that are proposed; leading axis `point`."""
 
+    chain: np.ndarray
+    """To which chain."""
     kind: np.ndarray
     structure: np.ndarray
     z: np.ndarray
@@ -86,19 +88,52 @@ class ObjectMove:
         highest = flat.max(axis=1)
         return highest + np.log(np.exp(flat - highest[:, None]).sum(axis=1))
 
-    def draw(self, rng: np.random.Generator) -> Choice:
-        """Propose kind, structure and coordinates afresh."""
-        num_chains = len(self._log_weight)
-        flat = self._log_weight.reshape(num_chains, -1)
-        chosen = draw_index(rng, flat)
-        kind, bump = np.divmod(chosen, self._bumps.num)
-        return self._draw_from(rng, kind, bump)
+    def draw(self, rng: np.random.Generator, num_tries: int = 1) -> Choice:
+        """Propose kind, structure and coordinates afresh.
+
+        Args:
+            rng: source of randomness.
+            num_tries: proposals of each chain, which are neighbours in the answer.
+        """
+        chain, kind, bump = self._draw_bumps(rng, num_tries)
+        choice = self._choice(chain, kind, bump, self._product(chain, kind, bump, rng))
+        found = (choice.chain, choice.kind, choice.structure, choice.z)
+        return choice._replace(log_ratio=self.log_ratio(*found))
+
+    def draw_or_keep(
+        self,
+        rng: np.random.Generator,
+        is_kept: np.ndarray,
+        kind: np.ndarray,
+        structure: np.ndarray,
+        z: np.ndarray,
+    ) -> Choice:
+        """Propose afresh in some chains; in the others, take what is given.
+
+        Args:
+            rng: source of randomness.
+            is_kept: which chains take what is given, `[chain]`.
+            kind: for those; of the others, anything.
+            structure: likewise.
+            z: likewise, `[chain, dim]`.
+        """
+        chain, new, bump = self._draw_bumps(rng, 1)
+        choice = self._choice(chain, new, bump, self._product(chain, new, bump, rng))
+        kind = np.where(is_kept, kind, choice.kind)
+        structure = np.where(is_kept, structure, choice.structure)
+        z = np.where(is_kept[:, None], z, choice.z)
+        ratio = self.log_ratio(chain, kind, structure, z)
+        return Choice(chain, kind, structure, z, ratio, choice.is_inside | is_kept)
 
     def log_ratio(
-        self, kind: np.ndarray, structure: np.ndarray, z: np.ndarray
+        self,
+        chain: np.ndarray,
+        kind: np.ndarray,
+        structure: np.ndarray,
+        z: np.ndarray,
     ) -> np.ndarray:
-        """Log of target over proposal at any point, the likelihood left out."""
-        pair = self._pair[np.arange(len(kind)), kind]
+        """Log of target over proposal at any points, the likelihood left out."""
+        pair = self._pair[chain, kind]
         in_use = self._in_use[structure]
         start, variance = self._start[pair], self._variance[pair]
         offset = wrap(z[:, None, :] - self._bumps.centre, self._period)
@@ -110,7 +145,7 @@ class ObjectMove:
         )
         highest = density.max(axis=1)
         proposal = highest + np.log(np.exp(density - highest[:, None]).sum(axis=1))
-        exact = self._log_exact(kind, z)
+        exact = self._log_exact(chain, kind, z)
         return np.sum(np.where(in_use, exact, 0.0), axis=1) - proposal
 
     def nudge(
@@ -141,20 +176,26 @@ class ObjectMove:
         is_same = self._bumps.structure == structure[:, None]
         bump = draw_index(rng, np.where(is_same, of_kind, -np.inf))
         offset = wrap(z - self._bumps.centre[bump], self._period)
-        mean = self._product(kind, bump, None)
-        fresh = self._product(kind, bump, rng)
+        mean = self._product(chains, kind, bump, None)
+        fresh = self._product(chains, kind, bump, rng)
         new = mean + np.sqrt(1.0 - share**2) * (offset - mean) + share * (fresh - mean)
-        choice = self._choice(kind, bump, new, False)
+        choice = self._choice(chains, kind, bump, new)
         before = self._one_bump_ratio(kind, bump, offset, z)
         after = self._one_bump_ratio(kind, bump, new, choice.z)
         return choice._replace(log_ratio=after), before
 
-    def _draw_from(self, rng, kind: np.ndarray, bump: np.ndarray) -> Choice:
-        return self._choice(kind, bump, self._product(kind, bump, rng), True)
+    def _draw_bumps(self, rng, num_tries: int) -> tuple[np.ndarray, ...]:
+        """A chain, a kind and a bump for each proposal."""
+        num_chains = len(self._log_weight)
+        flat = self._log_weight.reshape(num_chains, -1)
+        chosen = draw_index(rng, flat, num_tries).reshape(-1)
+        return np.repeat(np.arange(num_chains), num_tries), *np.divmod(
+            chosen, self._bumps.num
+        )
 
-    def _product(self, kind, bump, rng) -> np.ndarray:
+    def _product(self, chain, kind, bump, rng) -> np.ndarray:
         """A draw of bumps times kinds, or their means; relative to the centres."""
-        pair = self._pair[np.arange(len(kind)), kind]
+        pair = self._pair[chain, kind]
         residual = self._bumps.residual[bump]
         start = self._start[pair, bump]
         zero, none = np.zeros_like(start), np.zeros_like(residual)
@@ -168,33 +209,41 @@ class ObjectMove:
             none if rng is None else rng.standard_normal(residual.shape),
         )
 
-    def _choice(self, kind, bump, offset, with_ratio: bool) -> Choice:
+    def _choice(self, chain, kind, bump, offset) -> Choice:
         structure = self._bumps.structure[bump]
         in_use = self._in_use[structure]
         is_angle = (self._period > 0) & in_use
         is_inside = np.all(~is_angle | (2.0 * np.abs(offset) < self._period), axis=1)
         z = wrap(self._bumps.centre[bump] + offset, self._period)
         z = np.where(in_use, z, 0.0)
-        ratio = np.zeros(len(kind))
-        if with_ratio:
-            ratio = self.log_ratio(kind, structure, z)
-        return Choice(kind, structure, z, ratio, is_inside)
+        return Choice(chain, kind, structure, z, np.zeros(len(kind)), is_inside)
 
     def _one_bump_ratio(self, kind, bump, offset, z) -> np.ndarray:
         """Exact density over that of one bump times the kind's normal density."""
-        pair = self._pair[np.arange(len(kind)), kind]
+        chains = np.arange(len(kind))
+        pair = self._pair[chains, kind]
         in_use = self._in_use[self._bumps.structure[bump]]
         start, variance = self._start[pair, bump], self._variance[pair]
         normal = log_normal(offset, start, variance, in_use)
         gap = np.einsum("pd,pdr->pr", offset, self._bumps.factor[bump])
         gap -= self._bumps.residual[bump]
-        exact = np.where(in_use, self._log_exact(kind, z), 0.0).sum(axis=1)
+        exact = np.where(in_use, self._log_exact(chains, kind, z), 0.0).sum(axis=1)
         return exact - normal + 0.5 * np.sum(gap**2, axis=1)
 
 
-def draw_index(rng: np.random.Generator, log_weight: np.ndarray) -> np.ndarray:
-    """An index of the last axis with probability in proportion to exp(log-weight)."""
+def draw_index(
+    rng: np.random.Generator, log_weight: np.ndarray, num: int | None = None
+) -> np.ndarray:
+    """Indices of the last axis with probability in proportion to exp(log-weight).
+
+    Args:
+        rng: source of randomness.
+        log_weight: at least one of each row is finite.
+        num: how many of each row, `[..., num]`; None: one, `[...]`.
+    """
     weight = np.exp(log_weight - log_weight.max(axis=-1, keepdims=True))
     cumulative = np.cumsum(weight, axis=-1)
-    level = (1.0 - rng.random(cumulative.shape[:-1])) * cumulative[..., -1]
-    return np.sum(cumulative < level[..., None], axis=-1)
+    shape = (*cumulative.shape[:-1], 1 if num is None else num)
+    level = (1.0 - rng.random(shape)) * cumulative[..., -1:]
+    found = np.sum(cumulative[..., None, :] < level[..., None], axis=-1)
+    return found[..., 0] if num is None else found

@@ -15,6 +15,7 @@ import numpy as np
 from boomdp_jax.inference.collapsed_gibbs import (
     decide,
     draw_spreads,
+    num_tries,
 )
 from boomdp_jax.inference.concentration import draw_stick_concentration
 from boomdp_jax.inference.kind_state import (
@@ -67,9 +68,9 @@ def sweep_sticks(
     variance[..., angles] = np.minimum(variance[..., angles], wide)
     chains = np.arange(len(state.kind))
 
-    def log_exact(kind: np.ndarray, z: np.ndarray) -> np.ndarray:
-        own = centre[chains, kind, :dim]
-        return part.log_given_centre(z, own, spread[chains, kind])
+    def log_exact(chain: np.ndarray, kind: np.ndarray, z: np.ndarray) -> np.ndarray:
+        own = centre[chain, kind, :dim]
+        return part.log_given_centre(z, own, spread[chain, kind])
 
     accepted = np.ones(data.num_objects)
     with np.errstate(divide="ignore"):
@@ -85,8 +86,10 @@ def sweep_sticks(
             log_weight, log_structures, centre[..., :dim], variance, log_exact
         )
         move = ObjectMove(bumps, data.in_use, part.period, kinds)
-        before = move.log_ratio(state.kind[:, i], state.structure[:, i], state.z[:, i])
-        accepted[i] = decide(rng, data, state, i, move.draw(rng), before)
+        own = (state.kind[:, i], state.structure[:, i], state.z[:, i])
+        before = move.log_ratio(chains, *own)
+        choice = move.draw(rng, num_tries(len(chains)))
+        accepted[i] = decide(rng, data, state, i, choice, before)
     if not fixed_concentration:
         state.concentration[:] = draw_stick_concentration(
             rng, sticks, data.prior.concentration_shape, data.prior.concentration_rate
