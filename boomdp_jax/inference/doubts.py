@@ -3,6 +3,7 @@
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.drag_doubts import drag_reasons
 from boomdp_jax.inference.lever_doubts import lever_reasons
+from boomdp_jax.inference.pose_velocity_agreement import pose_velocity_reasons
 from boomdp_jax.inference.posterior import Posterior, with_diagnostics
 from boomdp_jax.inference.run_breaks import run_break_reasons
 from boomdp_jax.inference.stance_doubts import stance_reasons
@@ -33,6 +34,7 @@ def with_doubts(
     """
     reasons = [
         *run_break_reasons(spec, history),
+        *pose_velocity_reasons(spec, history),
         *lever_reasons(spec, posterior),
         *angle_reasons(spec, history, posterior),
         *stance_reasons(spec, posterior),

@@ -11,6 +11,7 @@ from boomdp_jax.core.history import History
 from boomdp_jax.inference.kind_objects import ObjectsAlone
 from boomdp_jax.inference.kinds_file import LearntKinds
 from boomdp_jax.inference.outliers import outlier_notes
+from boomdp_jax.inference.pose_velocity_agreement import pose_velocity_reasons
 from boomdp_jax.inference.posterior import Posterior, with_diagnostics
 from boomdp_jax.inference.run_breaks import run_break_reasons
 from boomdp_jax.inference.stance_doubts import stance_reasons
@@ -137,6 +138,7 @@ def with_kind_doubts(
     )
     reasons = [
         *run_break_reasons(spec, used),
+        *pose_velocity_reasons(spec, used),
         *angle_reasons(spec, used, posterior),
         *stance_reasons(spec, posterior),
     ]

@@ -5,6 +5,10 @@ against the other by at most L, the distance in between is at least
 $(d_0 + d_1 - L) / 2$. Where that is less than what noise may hide they may have
 touched: they are inferred together, and their contact is simulated.
 
+A disc is where it is whichever way it points. Another outline whose angle was not read
+is taken for the circle round it, which errs towards having touched; and bodies that
+were read in turn are looked at where one is read and the other between two readings.
+
 Bodies whose file leaves friction or restitution open share one unknown number of each.
 So all that may have touched something with an open number belongs to one block.
 """
@@ -22,6 +26,7 @@ from boomdp_jax.core.arrays import on_device
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.outliers import SD_OF_MEDIAN
 from boomdp_jax.inference.prior import read_prior
+from boomdp_jax.inference.tie_tracks import bridged_tracks
 from boomdp_jax.physics.body_spec import BodySpec
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.scene_spec import SceneSpec
@@ -90,25 +95,70 @@ def find_touching(spec: SceneSpec, history: History) -> Touching | None:
         return None
     may = np.asarray(scene.collides).copy()
     may &= ~(spec.is_static[:, None] & spec.is_static[None])
-    pose, seen, run = _poses(spec, history)
+    readings = _readings(spec, history)
     scale = read_prior(spec.prior, spec.source).noise
-    noise = _noise(pose, seen, run, scale["position"], scale["angle"])
+    noise = _noise(readings, scale["position"], scale["angle"])
     reach = np.array([_reach(body) for body in spec.bodies])
     sd = np.hypot(noise[:, 0], noise[:, 1] * reach)
+    tracks = [readings]
+    if not np.all(readings.is_read):
+        tracks.append(_between(spec, history))
     pairs = np.zeros_like(may)
     for a, b in itertools.combinations(range(spec.num_bodies), 2):
-        use = seen[:, a] & seen[:, b]
-        if not may[a, b] or not use.any():
-            continue
-        margin = _NUM_SDS * np.hypot(sd[a], sd[b])
-        place = pose[use][:, [a, b]]
-        far = np.hypot(*(place[:, 0, :2] - place[:, 1, :2]).T) - reach[a] - reach[b]
-        is_near = _comes_near(far, place, run[use], reach[[a, b]], margin)
-        if is_near:
-            apart = _separation(scene, place, a, b)
-            is_near = _comes_near(apart, place, run[use], reach[[a, b]], margin)
-        pairs[a, b] = pairs[b, a] = is_near
+        if may[a, b]:
+            margin = _NUM_SDS * float(np.hypot(sd[a], sd[b]))
+            near = (_is_near(spec, one, (a, b), reach, margin) for one in tracks)
+            pairs[a, b] = pairs[b, a] = any(near)
     return Touching(pairs, unknown_contact(spec))
+
+
+class _Readings(NamedTuple):
+    """Poses in order of time."""
+
+    pose: Float[np.ndarray, "reading body 3"]
+    is_read: Bool[np.ndarray, "reading body 3"]
+    run: Int[np.ndarray, " reading"]
+    """Which run each belongs to."""
+    error: Float[np.ndarray, "reading body 3"]
+    """By how much they may be off besides their noise."""
+
+
+def _is_near(
+    spec: SceneSpec,
+    readings: _Readings,
+    two: tuple[int, int],
+    reach: np.ndarray,
+    margin: float,
+) -> bool:
+    """Whether two bodies may have been closer than a margin [m]."""
+    is_read = readings.is_read[:, two]
+    use = np.all(is_read[..., :2], axis=(1, 2))
+    if not np.any(use):
+        return False
+    place, run, reach = readings.pose[use][:, two], readings.run[use], reach[list(two)]
+    is_disc = np.array([_is_disc(spec.bodies[i]) for i in two])
+    # Which way a disc points is nothing, and neither is how it turns.
+    place = np.where(is_disc[:, None] & [False, False, True], 0.0, place)
+    off = readings.error[use][:, two]
+    off = np.sum(np.hypot(off[..., 0], off[..., 1]) + off[..., 2] * reach, axis=1)
+    far = np.hypot(*(place[:, 0, :2] - place[:, 1, :2]).T) - np.sum(reach) - off
+    if not _comes_near(far, place, run, reach, margin):
+        return False
+    is_turned = is_read[use][..., 2] | is_disc
+    whole = np.all(is_turned, axis=1)
+    if np.any(~whole):
+        # The circle round an outline is nowhere farther, whichever way it turns.
+        place = np.where(whole[:, None, None] | [True, True, False], place, 0.0)
+        beside = ~whole
+        beside[1:] |= ~whole[:-1]
+        beside[:-1] |= ~whole[1:]
+        if _comes_near(np.where(beside, far, np.inf), place, run, 0.0 * reach, margin):
+            return True
+    if not np.any(whole):
+        return False
+    place, run = place[whole], run[whole]
+    apart = _separation(spec.scene, place, *two) - off[whole]
+    return _comes_near(apart, place, run, reach, margin)
 
 
 def _comes_near(apart, place, run, reach, margin: float) -> bool:
@@ -122,8 +172,8 @@ def _comes_near(apart, place, run, reach, margin: float) -> bool:
     return bool(np.any((least < margin) & (run[1:] == run[:-1])))
 
 
-def _poses(spec: SceneSpec, history: History) -> tuple:
-    """Poses in order of time, which were read, and the run that each belongs to."""
+def _readings(spec: SceneSpec, history: History) -> _Readings:
+    """What was read, unread angles as zero."""
     rows = np.asarray(history.mask)
     episode = np.asarray(history.episode)[rows]
     parts = [
@@ -137,30 +187,49 @@ def _poses(spec: SceneSpec, history: History) -> tuple:
     pose = np.stack([part[0] for part in parts], axis=1)
     mask = np.stack([part[1] for part in parts], axis=1)
     pose, mask = (x.reshape(num, spec.num_bodies, 3) for x in (pose, mask))
-    seen = np.all(mask, axis=-1)
+    return _with_static(
+        spec, _Readings(pose, mask, np.repeat(episode, 2), np.zeros_like(pose))
+    )
+
+
+def _between(spec: SceneSpec, history: History) -> _Readings:
+    """The same with what lies between readings."""
+    tracks = bridged_tracks(history)
+    is_known = np.isfinite(tracks.pose)
+    pose = np.where(is_known, tracks.pose, 0.0)
+    return _with_static(spec, _Readings(pose, is_known, tracks.run, tracks.error))
+
+
+def _with_static(spec: SceneSpec, readings: _Readings) -> _Readings:
+    """The same with bodies that stay where the scene puts them."""
+    pose, is_read = np.array(readings.pose), np.array(readings.is_read)
     for index, body in enumerate(spec.bodies):
         if body.is_static and body.pose is not None:
-            pose[:, index], seen[:, index] = body.pose, True
-    return pose, seen, np.repeat(episode, 2)
+            pose[:, index], is_read[:, index] = body.pose, True
+    return readings._replace(pose=pose, is_read=is_read)
 
 
-def _noise(pose, seen, run, position: float, angle: float) -> Float[np.ndarray, "b 2"]:
+def _noise(
+    readings: _Readings, position: float, angle: float
+) -> Float[np.ndarray, "b 2"]:
     """Noise of positions [m] and angles [rad], no less than the prior's.
 
     By the median of what three readings in a row depart from a line by, which an impact
     does not change and a steady push hardly.
     """
-    out = np.tile([position, angle], (pose.shape[1], 1)).astype(float)
+    out = np.tile([position, angle], (readings.pose.shape[1], 1)).astype(float)
     # Rows end where the next ones begin, or close to it: one reading of each instant.
-    pose, seen, run = pose[1::2], seen[1::2], run[1::2]
+    pose, is_read, run = readings.pose[1::2], readings.is_read[1::2], readings.run[1::2]
     if len(pose) < 3:
         return out
     bend = np.abs(pose[2:] - 2.0 * pose[1:-1] + pose[:-2]) / np.sqrt(6.0)
-    whole = seen[2:] & seen[1:-1] & seen[:-2] & (run[2:] == run[:-2])[:, None]
-    for body in range(pose.shape[1]):
-        if whole[:, body].any():
-            middle = SD_OF_MEDIAN * np.median(bend[whole[:, body], body], axis=0)
-            out[body] = np.maximum(out[body], [max(middle[:2]), middle[2]])
+    same = (run[2:] == run[:-2])[:, None, None]
+    whole = is_read[2:] & is_read[1:-1] & is_read[:-2] & same
+    for body, channel in np.ndindex(*whole.shape[1:]):
+        of_it = bend[whole[:, body, channel], body, channel]
+        if len(of_it):
+            sd, part = SD_OF_MEDIAN * np.median(of_it), channel // 2
+            out[body, part] = max(out[body, part], sd)
     return out
 
 
@@ -190,3 +259,8 @@ def _apart(scene: Scene, index: Int[Array, "2"], place: Float[Array, "reading 2 
 def _reach(body: BodySpec) -> float:
     """Farthest point of an outline from the centre of mass [m]."""
     return body.radius + float(np.max(np.hypot(*body.vertices.T), initial=0.0))
+
+
+def _is_disc(body: BodySpec) -> bool:
+    """Whether an outline is the same whichever way it points."""
+    return float(np.max(np.hypot(*body.vertices.T), initial=0.0)) == 0.0
