@@ -1,5 +1,6 @@
 """What was observed: a fixed-capacity, masked table of transitions."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -31,6 +32,33 @@ def is_same_reading(one: Any, other: Any) -> Any:
     return abs(one - other) <= _SAME_READING * (1.0 + abs(one))
 
 
+def is_read_anew(now: Any, is_read: Any, before: Any, was_read: Any) -> Any:
+    """Which channels of where a row starts are not those that the row before ended at.
+
+    The pose of a body is read at once, and so are its velocities: of those channels
+    that were read both times either all are one reading or none is. (Of two readings
+    that are rounded a few channels agree by chance; leaving those out would tell of
+    noise that is not there.) A channel that was read the second time only is new,
+    whatever the others are.
+
+    Args:
+        now: readings that a row starts from, `[*any, body, 6]`.
+        is_read: which of them there are.
+        before: readings that the row before ended at.
+        was_read: which of them there are.
+
+    Returns:
+        True where there is a reading to learn from, `[*any, body, 6]`.
+    """
+
+    def parts(channels: Any) -> Any:
+        return channels.reshape(*channels.shape[:-1], 2, 3)
+
+    differs = parts(is_read & was_read & ~is_same_reading(now, before))
+    is_new = differs.any(axis=-1, keepdims=True) | ~parts(was_read)
+    return is_read & is_new.reshape(is_read.shape)
+
+
 class Transition(eqx.Module):
     """One observed step (s, a, s') of every body.
 
@@ -49,8 +77,9 @@ class History(eqx.Module):
     """A table of transitions with a mask, so that a longer history never recompiles.
 
     Missing readings are masked channel by channel and hold zero. `is_chained[t]` says
-    that the reading `state[t]` is the very reading `next_state[t - 1]`, up to rounding
-    (`is_same_reading`).
+    that no channel was read twice between rows `t - 1` and `t` of a run: what
+    `state[t]` and `next_state[t - 1]` both hold is the very same, up to rounding
+    (`is_same_reading`), and either may lack channels that the other has.
     """
 
     state: Float[Array, "*batch time body 6"]
@@ -82,6 +111,34 @@ class History(eqx.Module):
     def transitions(self) -> Transition:
         """All rows, masked ones included."""
         return Transition(self.state, self.action, self.next_state, self.dt)
+
+    def is_start_new(self, bodies: Sequence[int]) -> Bool[np.ndarray, "time body 6"]:
+        """Which readings of `state` are not those that the row before ended at.
+
+        Args:
+            bodies: indices of those asked about.
+
+        Returns:
+            True for readings that a filter has not taken in with the row before; worked
+            out on the host, of a history without a batch axis.
+        """
+        index = np.asarray(bodies)
+        rows, episode = np.asarray(self.mask), np.asarray(self.episode)
+        first, is_read, last, was_read = (
+            np.asarray(leaf)[:, index]
+            for leaf in (
+                self.state,
+                self.state_mask,
+                self.next_state,
+                self.next_state_mask,
+            )
+        )
+        is_new = is_read & rows[:, None, None]
+        starts = ~(rows[:-1] & (episode[1:] == episode[:-1]))[:, None, None]
+        is_new[1:] &= starts | is_read_anew(
+            first[1:], is_read[1:], last[:-1], was_read[:-1]
+        )
+        return is_new
 
     def padded(self, capacity: int) -> "History":
         """The same table with room for more rows, on the host.
@@ -208,8 +265,9 @@ def make_history(
     is_chained = np.zeros(num_rows, bool)
     if num_rows > 1:
         now, before = state[1:], next_state[:-1]
-        is_missing = np.isnan(now) & np.isnan(before)
-        same = np.all(is_same_reading(now, before) | is_missing, axis=(1, 2))
+        is_read, was_read = ~np.isnan(now), ~np.isnan(before)
+        is_twice = was_read & is_read_anew(now, is_read, before, was_read)
+        same = ~np.any(is_twice, axis=(1, 2))
         is_chained[1:] = same & (episode[1:] == episode[:-1])
 
     def pad(array, fill=0):

@@ -131,12 +131,18 @@ def load_run(folder: str | os.PathLike) -> LoadedRun:
         folder: what `run --out` wrote.
 
     Raises:
-        ValueError: a folder of something else, or without an episode.
+        ValueError: a folder of something else, of a task without rewards, or without an
+            episode.
         OSError: it cannot be read.
     """
     folder = Path(folder)
     check_is_run(folder)
     content = read_json(folder / "run.json", SCHEMA)
+    if content["task"] == "namo":
+        raise ValueError(
+            f"{folder}: task: expected one with a reward for each step, got 'namo'; "
+            "what came of its rooms is in results.npz, and `view` shows them"
+        )
     seeds = [folder / f"seed-{seed:05d}.npz" for seed in range(content["num_seeds"])]
     records = [read_npz(path) for path in seeds if path.exists()]
     if not records:

@@ -36,15 +36,13 @@ def is_at_rest(spec: SceneSpec, history: History, body: int, fewest: int = 2) ->
     rows = np.asarray(history.mask)
     episode = np.asarray(history.episode)[rows]
     parts = []
-    for values, mask in (
-        (history.state, history.state_mask),
-        (history.next_state, history.next_state_mask),
+    for values, is_read in (
+        # The end of a row is the start of the next one: one reading, not two.
+        (history.state, history.is_start_new([body])[:, 0]),
+        (history.next_state, np.asarray(history.next_state_mask)[:, body]),
     ):
         array = np.asarray(values, float)[rows, body]
-        parts.append(np.where(np.asarray(mask)[rows, body], array, np.nan))
-    # The end of a row is the start of the next one: one reading, not two.
-    is_last = np.append(~np.asarray(history.is_chained)[rows][1:], True)
-    parts[1][~is_last] = np.nan
+        parts.append(np.where(is_read[rows], array, np.nan))
     reading = np.stack(parts, axis=1).reshape(-1, 6)
     run = np.repeat(episode, 2)
     if not np.any(np.all(np.isfinite(reading[:, :2]), axis=-1)):

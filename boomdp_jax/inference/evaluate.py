@@ -135,7 +135,7 @@ def _gather_restarted(targets: StructureTarget, owners, start, owner, num, z):
         data,
         (
             jnp.ones_like(is_used),
-            jnp.zeros_like(is_used),
+            jnp.zeros_like(start),
             start,
             jnp.zeros_like(start),
             jnp.broadcast_to(is_used[..., None, None], start.shape),

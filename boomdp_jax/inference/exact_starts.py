@@ -50,16 +50,16 @@ def open_loop_gains(data: TrackData, scale: np.ndarray, starts: ExactStarts) -> 
     begins, counts = _predictions(data, starts)
     num_rows, num = len(begins), data.steps.state.shape[1] * 6
     weight = 1.0 / np.asarray(scale).reshape(-1)[None]
-    first = np.asarray(data.first_mask).reshape(num_rows, num)
     last = np.asarray(data.last_mask).reshape(num_rows, num)
-    is_second = (np.asarray(data.is_second) > 0) & counts & ~begins
+    second = np.asarray(data.is_second).reshape(num_rows, num)
+    is_between = counts & ~begins
     # Where a track starts its state is that reading already.
     jumps = begins & ~(np.asarray(data.is_start) > 0)
     identity = np.broadcast_to(np.eye(num), (num_rows, num, num))
     parts = (
         jumps[:, None, None] * identity,
         0.0 * identity,
-        identity * (is_second[:, None] * first * weight)[:, None, :],
+        identity * (is_between[:, None] * second * weight)[:, None, :],
         identity * (counts[:, None] * last * weight)[:, None, :],
     )
     dtype = data.steps.state.dtype

@@ -81,7 +81,7 @@ def filter_density(
         covariance = jnp.where(row.is_start > 0, at_start, covariance)
         miss = channel_difference(row.first, state).reshape(-1)
         shift, covariance, first_density = _correct(
-            covariance, miss, row.is_second * seen, variance, data.freedom
+            covariance, miss, row.is_second.reshape(-1), variance, data.freedom
         )
         state = state + shift.reshape(state.shape)
         offset = neighbour_scales(scale, jnp.diagonal(covariance))
@@ -140,7 +140,7 @@ def _density_of_one_body(
             at_start,
             lower,
             channel_differences(row.first, state),
-            [row.is_second * mask for mask in seen],
+            [row.is_second[0, i] for i in num],
             variance,
         )
         state = [x + move for x, move in zip(state, shift, strict=True)]

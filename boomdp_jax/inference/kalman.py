@@ -170,7 +170,7 @@ class RowFilter:
         )
         start = estimate.mean
         (state, covariance), first_gain, first_whitening, first_density = self._update(
-            estimate, row.first, row.is_second * row.first_mask
+            estimate, row.first, row.is_second
         )
         offset = neighbour_scales(self._scale, jnp.diagonal(covariance))
         offsets = jnp.diag(offset).reshape(num, *state.shape)

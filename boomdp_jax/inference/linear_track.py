@@ -299,7 +299,7 @@ def _filter_lanes(shared, rows: _Row, read: TrackRow, owner, reading, impulse):
         row, read = jax.tree.map(lambda leaf: leaf[owner], inputs)
         begins = read.is_start > 0
         first_mask, last_mask = in_lanes(read.first_mask), in_lanes(read.last_mask)
-        first_used = read.is_second[None] * first_mask
+        first_used = in_lanes(read.is_second)
         moved = in_lanes(difference(at, row.state))
         start = in_lanes(difference(read.start, row.state))
         moved = jnp.where(begins[None], start, moved)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar, on_device
 from boomdp_jax.core.checked_input import positive_seconds
-from boomdp_jax.core.history import History, is_same_reading
+from boomdp_jax.core.history import History, is_read_anew
 from boomdp_jax.inference.track_data import TrackData, TrackRow
 
 
@@ -25,6 +25,8 @@ class NewRow(NamedTuple):
     next_state_mask: Bool[Array, "body 6"]
     starts_episode: BoolScalar
     is_chained: BoolScalar
+    is_start_new: Bool[Array, "body 6"]
+    """As `History` has them."""
 
 
 def can_happen(action: Float[Array, "body 3"], dt: FloatScalar) -> BoolScalar:
@@ -84,8 +86,8 @@ def new_row(
     state = jnp.where(first, state, 0.0).astype(history.state.dtype)
     next_state = jnp.where(last, next_state, 0.0).astype(history.state.dtype)
     before = jnp.maximum(num_rows - 1, 0)
-    is_same = jnp.all(is_same_reading(state, history.next_state[before]))
-    is_same = is_same & jnp.all(first == history.next_state_mask[before])
+    was_read = history.next_state_mask[before]
+    is_new = is_read_anew(state, first, history.next_state[before], was_read)
     starts_episode = starts_episode | (num_rows == 0) | ~is_pushed
     return NewRow(
         state=state,
@@ -95,7 +97,8 @@ def new_row(
         state_mask=first,
         next_state_mask=last,
         starts_episode=starts_episode,
-        is_chained=is_same & ~starts_episode,
+        is_chained=~jnp.any(is_new & was_read) & ~starts_episode,
+        is_start_new=jnp.where(starts_episode, first, is_new),
     )
 
 
@@ -179,7 +182,7 @@ def track_row_of(
     seen = jnp.maximum(jnp.sum(data.first_mask, axis=0), 1.0)
     mean = jnp.sum(data.first_mask * data.steps.state, axis=0) / seen
     guess = jnp.where(jnp.arange(6)[None] < 3, mean, 0.0)
-    is_second = ~is_start & ~row.is_chained
+    is_second = ~is_start & row.is_start_new[bodies]
     one = jnp.ones((), dtype)
     return TrackRow(
         is_start=is_start.astype(dtype),

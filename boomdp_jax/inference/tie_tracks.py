@@ -45,7 +45,11 @@ def bridged_tracks(history: History) -> Tracks:
             (history.next_state, history.next_state_mask),
         )
     )
-    starts = np.flatnonzero(~np.asarray(history.is_chained)[rows])
+    is_chained = np.asarray(history.is_chained)[rows]
+    # Channels of an instant that only the row before it has.
+    is_only = np.isnan(before[1:]) & is_chained[1:, None, None]
+    before[1:] = np.where(is_only, after[:-1], before[1:])
+    starts = np.flatnonzero(~is_chained)
     dt = np.asarray(history.dt, float)[rows]
     none = np.zeros((0, history.num_bodies, 3))
     poses, errors, run = [none], [none], [np.zeros(0, int)]

@@ -18,7 +18,7 @@ class TrackRow(NamedTuple):
     """One row of a `TrackData`, or all of them with a leading time axis."""
 
     is_start: Float[Array, "*time"]
-    is_second: Float[Array, "*time"]
+    is_second: Float[Array, "*time body 6"]
     start: Float[Array, "*time body 6"]
     first: Float[Array, "*time body 6"]
     first_mask: Float[Array, "*time body 6"]
@@ -34,8 +34,8 @@ class TrackData(eqx.Module):
     """What a filter needs of a history, for the bodies of one block.
 
     A row either starts a track at its own first reading, or goes on from the row
-    before; then its first reading is either the very one that ended the row before, or
-    a second reading of the same instant.
+    before; then each channel of its first reading is either the very one that ended the
+    row before, or another reading of the same instant.
     """
 
     steps: Readings
@@ -45,8 +45,9 @@ class TrackData(eqx.Module):
     last_mask: Float[Array, "time body 6"]
     """One where the last reading of a row was read."""
     is_start: Float[Array, " time"]
-    is_second: Float[Array, " time"]
-    """One where the first reading is a second one of an instant already read."""
+    is_second: Float[Array, "time body 6"]
+    """One where a row that goes on has a first reading that did not end the one before,
+    to be taken in before the row: a second one, or the only one of that channel."""
     start: Float[Array, "time body 6"]
     """Where a track would start in each row: readings, or a guess where missing."""
     weight: Float[Array, " time"] | None = None
@@ -117,6 +118,7 @@ def track_data(
     state, rows = np.asarray(steps.state), np.asarray(history.mask)
     first = np.asarray(history.state_mask)[:, index] & rows[:, None, None]
     last = np.asarray(history.next_state_mask)[:, index] & rows[:, None, None]
+    is_new = history.is_start_new(bodies)
     episode = np.asarray(history.episode)
     same = np.zeros(rows.shape, bool)
     same[1:] = (episode[1:] == episode[:-1]) & rows[:-1]
@@ -135,7 +137,7 @@ def track_data(
         first_mask=on_device(first, dtype),
         last_mask=on_device(last, dtype),
         is_start=on_device(~goes_on, dtype),
-        is_second=on_device(goes_on & ~np.asarray(history.is_chained), dtype),
+        is_second=on_device(goes_on[:, None, None] & is_new, dtype),
         start=on_device(guess, dtype),
         freedom=freedom,
     )

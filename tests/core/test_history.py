@@ -54,6 +54,25 @@ def test_readings_chain_within_an_episode_only():
     np.testing.assert_array_equal(history.is_chained, [False, True, False, True, False])
 
 
+def test_channels_that_one_end_of_an_instant_lacks_do_not_part_the_others():
+    """Of bodies of their own; a row that has nothing in common follows as well."""
+    rng = np.random.default_rng(1)
+    reading = rng.normal(size=(5, 2, 6))
+    state, last = reading[:-1].copy(), reading[1:].copy()
+    last[0, 0, 3:], state[1, 1, 1] = np.nan, np.nan
+    # Poses alone are read a second time, but for an angle that agrees by chance.
+    last[1, 0, [0, 1]] += 1e-3
+    last[2, 1], state[3, 0] = np.nan, np.nan
+    history = make_history(state, np.zeros((4, 2, 3)), last, 0.1)
+    np.testing.assert_array_equal(history.is_chained, [False, True, False, True])
+    is_new = np.zeros((4, 2, 6), bool)
+    is_new[0] = True
+    is_new[1, 0, 3:] = is_new[2, 0, :3] = is_new[3, 1] = True
+    np.testing.assert_array_equal(history.is_start_new([0, 1]), is_new)
+    apart = make_history(state, np.zeros((4, 2, 3)), last, 0.1, episode=np.arange(4))
+    np.testing.assert_array_equal(apart.is_start_new([0, 1]), apart.state_mask)
+
+
 @pytest.mark.parametrize("places", [None, 6], ids=["single precision", "six decimals"])
 def test_a_reading_that_was_rounded_on_its_way_is_one_reading(places):
     """Two would agree far better than any sensor, which then seems to have no noise."""

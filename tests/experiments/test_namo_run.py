@@ -89,6 +89,12 @@ def test_the_command_line_writes_rooms_and_goes_on(tmp_path, capsys):
     (tmp_path / "seed-00001.npz").write_bytes(b"cut short")
     assert main([*arguments, "2"]) == 0
     assert (tmp_path / "seed-00000.npz").stat().st_mtime_ns == before
+    # There are no rewards over steps to draw.
+    assert main(["plot", str(tmp_path)]) == 2
+    assert "expected one with a reward for each step, got 'namo'" in (
+        capsys.readouterr().err
+    )
+    assert not (tmp_path / "curves.png").exists()
     # Another run in the same folder is refused.
     assert main([*arguments, "3"]) == 2
     assert "num_seeds: expected 2" in capsys.readouterr().err

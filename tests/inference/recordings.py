@@ -12,6 +12,45 @@ INERTIA = MASS * (SIZE[0] ** 2 + SIZE[1] ** 2) / 3.0
 NOISE = np.array([1e-3, 1e-3, 1e-3, 5e-3, 5e-3, 5e-3])
 
 
+def lacking(
+    history: History, way: str, body: int = 0, seed: int = 0
+) -> tuple[History, History]:
+    """A chained recording with channels missing at one end of instants, and in full.
+
+    Args:
+        history: of one reading an instant, nothing missing.
+        way: `next` or `start`: ends, or starts of rows that go on, have no velocities;
+            `some`: any channel of either may be missing.
+        body: which of its bodies lacks them.
+        seed: of what is missing.
+
+    Returns:
+        It, and the same readings with both ends of an instant made equal.
+    """
+    state, last = np.array(history.state), np.array(history.next_state)
+    now, after = state[:, body], last[:, body]
+    goes_on = np.diff(np.asarray(history.episode), prepend=-1) == 0
+    rng = np.random.default_rng(seed)
+    if way == "next":
+        after[:, 3:] = np.nan
+    elif way == "start":
+        now[goes_on, 3:] = np.nan
+    else:
+        after[rng.random(after.shape) < 0.3] = np.nan
+        now[(rng.random(now.shape) < 0.3) & goes_on[:, None]] = np.nan
+
+    def table(first, second):
+        action, episode = np.asarray(history.action), np.asarray(history.episode)
+        dt = np.asarray(history.dt)
+        return make_history(first, action, second, dt, episode=episode)
+
+    full_state, full_last = state.copy(), last.copy()
+    rows = np.flatnonzero(goes_on)
+    instant = np.where(np.isnan(state[rows]), last[rows - 1], state[rows])
+    full_state[rows] = full_last[rows - 1] = instant
+    return table(state, last), table(full_state, full_last)
+
+
 def box_scene(
     unknown: dict[str, int] | None = None,
     *,

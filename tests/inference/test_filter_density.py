@@ -12,7 +12,15 @@ from boomdp_jax.inference.track_data import track_data
 from boomdp_jax.physics import State, step
 from boomdp_jax.physics.scene_spec import scene_spec_from_dict
 from tests.inference.joint_normal import joint_normal
-from tests.inference.recordings import AREA, DT, MASS, SIZE, box_scene, free_box
+from tests.inference.recordings import (
+    AREA,
+    DT,
+    MASS,
+    SIZE,
+    box_scene,
+    free_box,
+    lacking,
+)
 
 READING = np.array([1e-3, 2e-3, 5e-3, 4e-3])
 IMPULSE = np.array([3e-3, 2e-3])
@@ -103,6 +111,41 @@ def test_bodies_that_are_tied_are_filtered_as_by_the_other_filter():
     expected = extended_filter(spec.scene, spec.params(), data, level(2))
     found = filter_density(spec.scene, spec.params(), data, level(2))
     np.testing.assert_allclose(found, expected.log_likelihood, rtol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", ["next", "start", "some"])
+@pytest.mark.parametrize("freedom", [None, 4.0], ids=["normal", "student-t"])
+def test_a_channel_that_one_end_of_an_instant_lacks_is_read_once(way, freedom):
+    """Whatever the other channels do, and the other body, too."""
+    each = [free_box(np.random.default_rng(seed), 8) for seed in (4, 5)]
+    tie = {"type": "revolute", "a": "a", "b": "b"}
+    spec = two_bodies([{**tie, "anchor_a": [0.3, 0.0], "anchor_b": [-0.3, 0.1]}])
+
+    def density(history: History) -> float:
+        data = track_data(history, (0, 1), True, freedom=freedom)
+        return float(filter_density(spec.scene, spec.params(), data, level(2)))
+
+    history, full = lacking(side_by_side(*each), way, body=1)
+    found, expected = density(history), density(full)
+    # By Student-t noise the order in which channels are taken matters a little.
+    rtol = 1e-9 if freedom is None else 1e-3
+    np.testing.assert_allclose(found, expected, rtol=rtol)
+    one, same = lacking(each[1], way)
+    np.testing.assert_allclose(
+        density_of_box(one, MASS), density_of_box(same, MASS), rtol=1e-9
+    )
+
+
+@pytest.mark.slow
+def test_a_body_that_is_read_twice_leaves_others_read_once():
+    once = free_box(np.random.default_rng(4), 8)
+    twice = free_box(np.random.default_rng(5), 8, is_chained=False)
+    spec = two_bodies([])
+    data = track_data(side_by_side(once, twice), (0, 1), True)
+    found = filter_density(spec.scene, spec.params(), data, level(2))
+    expected = density_of_box(once, MASS) + density_of_box(twice, MASS)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
 def pinned_box(rng: np.random.Generator, num_rows: int):

@@ -15,6 +15,7 @@ from tests.inference.recordings import (
     MASS,
     box_scene,
     free_box,
+    lacking,
     response,
     transition_matrix,
 )
@@ -114,6 +115,17 @@ def test_missing_channels_are_left_out():
     found = run(history, MASS)[-1]
     expected = joint_log_density(history, MASS)
     np.testing.assert_allclose(found.log_likelihood, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("way", ["next", "start", "some"])
+def test_a_channel_that_one_end_of_an_instant_lacks_is_read_once(way):
+    whole = free_box(np.random.default_rng(7), 12, num_episodes=2)
+    history, full = lacking(whole, way)
+    found, same = run(history, MASS)[-1], run(full, MASS)[-1]
+    expected = joint_log_density(full, MASS)
+    np.testing.assert_allclose(found.log_likelihood, expected, rtol=1e-6)
+    np.testing.assert_allclose(same.log_likelihood, expected, rtol=1e-6)
+    assert float(found.gains.counts.sum()) == float(same.gains.counts.sum())
 
 
 def test_tracking_with_the_gains_repeats_the_filter():

@@ -60,24 +60,30 @@ def recorded(num_rows: int):
     next_state[6, 0, 3:] = np.nan
     state[7, 0, :] = next_state[6, 0, :]
     state[5, 0, 1] = np.nan
+    # What the two ends of an instant lack may differ.
+    next_state[7, 0, 4] = state[8, 0, 2] = np.nan
     return state, action, next_state, episode
 
 
 def appended(num_rows: int):
     """The same rows one by one, with the table of a block."""
-    state, action, next_state, episode = recorded(num_rows)
-    empty = make_history(state[:0], action[:0], state[:0], 0.1, capacity=CAPACITY)
-    history = eqx.tree_at(lambda h: h.dt, empty, jnp.full(CAPACITY, 0.1))
+    return appended_rows(*recorded(num_rows), 0.1)
+
+
+def appended_rows(state, action, next_state, episode, dt: float):
+    """Any rows."""
+    empty = make_history(state[:0], action[:0], state[:0], dt, capacity=CAPACITY)
+    history = eqx.tree_at(lambda h: h.dt, empty, jnp.full(CAPACITY, dt))
     data = track_data(history, (0,), True)
 
     @jax.jit
     def append(history, data, index, reading, starts):
-        new = new_row(history, index, *reading, jnp.asarray(0.1), starts)
+        new = new_row(history, index, *reading, jnp.asarray(dt), starts)
         row = track_row_of(data, new, jnp.asarray([0]), new.starts_episode)
         data = append_track_row(data, index, row, 1.0)
         return append_row(history, index, new), data
 
-    for row in range(num_rows):
+    for row in range(len(state)):
         starts = row > 0 and episode[row] != episode[row - 1]
         reading = tuple(jnp.asarray(x[row]) for x in (state, action, next_state))
         history, data = append(
