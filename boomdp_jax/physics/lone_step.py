@@ -1,6 +1,6 @@
 r"""One step of a lone body; the stages are those of `step`.
 
-Before its substeps a step brings an inconsistent pose onto the pin. After that a
+Before its substeps a step brings an inconsistent motion onto the pin. After that a
 pinned body only turns: where it is follows from its heading, and how it moves from its
 spin, so nothing drifts and nothing has to be put right. Both are written for every
 body, with zeros where there is no pin.
@@ -192,13 +192,31 @@ def _reported(body: LoneBody, turned: _Turned) -> tuple[FloatScalar, FloatScalar
 
 
 def _levelled(pivot: Pivot, turned: _Turned) -> _Turned:
-    """Bring a pose onto the pin by the smallest change in the sense of its mass."""
+    """Bring a motion onto the pin by the smallest change in the sense of its mass.
+
+    The pose, then the twist: of a start that slips along the pin, such as a kick or a
+    reading, the body would else turn for half a step by what the pin takes up at once.
+    """
     motion, turn = turned
-    x, y = pivot.anchor
-    off_x, off_y = _offset(pivot, motion, turn)
-    angle = pivot.levelling * (y * off_x - x * off_y)
+    arm_x, arm_y = out_of(turn, *pivot.anchor)
+    off_x = motion.x - pivot.world[0] + arm_x
+    off_y = motion.y - pivot.world[1] + arm_y
+    angle = pivot.levelling * (arm_y * off_x - arm_x * off_y)
+    turn = rotated(turn, angle)
+    arm_x, arm_y = out_of(turn, *pivot.anchor)
+    slip_x = motion.vx - arm_y * motion.spin
+    slip_y = motion.vy + arm_x * motion.spin
+    spin = motion.spin + pivot.levelling * (arm_y * slip_x - arm_x * slip_y)
     # Where it is follows from the heading.
-    return _Turned(motion._replace(theta=motion.theta + angle), rotated(turn, angle))
+    level = Motion(
+        x=motion.x,
+        y=motion.y,
+        theta=motion.theta + angle,
+        vx=pivot.free * motion.vx + spin * arm_y,
+        vy=pivot.free * motion.vy - spin * arm_x,
+        spin=spin,
+    )
+    return _Turned(level, turn)
 
 
 def _offset(pivot: Pivot, motion: Motion, turn: Pair) -> Pair:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from tests.physics.scenes import convergence_orders, run
+from tests.physics.scenes import CHUNK, convergence_orders, run
 from tests.reference.planar_dynamics import (
     Pin,
     World,
@@ -241,3 +241,22 @@ def test_friction_between_two_bodies_acts_on_both():
     start = momentum(world, pose, twist)[2]
     now = momentum(world, trajectory.pose[-1], trajectory.twist[-1])[2]
     assert abs(now - start) < 1e-3 * abs(start)
+
+
+@pytest.mark.parametrize("twist", [(0.0, 0.0, 0.65), (0.1, -0.2, 0.0), (0.3, 0.1, 2.0)])
+def test_a_kick_against_a_pin_moves_nothing(twist):
+    """What a pin takes up of a velocity at once does not turn the body before.
+
+    The noise of the motion is such kicks: else a pinned body's angle would have noise
+    of its own, of half a step times whatever spin the pin takes up.
+    """
+    world = pendulum()
+    pose, _ = swung(0.4)
+    arm = pose[0, :2] - PIVOT
+    mass, inertia = world.mass[0], world.inertia[0]
+    moment = mass * (arm[0] * twist[1] - arm[1] * twist[0]) + inertia * twist[2]
+    spin = moment / (mass * ARM**2 + inertia)
+    kicked = run(world, pose, np.array([twist]), dt=0.02, num_steps=CHUNK)
+    held = run(world, *swung(0.4, spin), dt=0.02, num_steps=CHUNK)
+    np.testing.assert_allclose(kicked.pose[0], held.pose[0], atol=2e-6)
+    np.testing.assert_allclose(kicked.twist[0], held.twist[0], atol=2e-5)
