@@ -12,7 +12,8 @@ and for noise. Rows in which all four were read tell, without any model,
   or, of what turns about a pin, twice as large;
 - units or steps that are not as told: r is k times the mean velocity;
 - steps that are not as long as told: r departs from the mean velocity along it, by more
-  the faster a body goes.
+  the faster a body goes;
+- velocities that nobody read, zero in all rows.
 
 Statistics count rows or compare medians, so that stops, impacts and gross errors in
 less than half of the rows decide nothing.
@@ -48,6 +49,8 @@ _LATE_SDS, _LEAST_LATE = 4.0, 0.2
 _LEAST_RATIO, _LEAST_LONG_RATIO, _RATIO_SDS = 1.1, 1.5, 5.0
 # Fewer rows tell nothing; so many have to bear the weight of a slope.
 _FEWEST, _LEAST_WEIGHED = 6, 4.0
+# Ranges of poses, in root mean squares of their steps, that are motion.
+_FAR = 6.0
 # Rows over which ratios are looked at besides single ones.
 _LONG_SPAN = 5
 _TWIST = {"positions": "velocities", "angles": "angular velocities"}
@@ -93,6 +96,12 @@ def _lines(parts: list[Steps]) -> list[str]:
     """What is said of one body."""
     lines, late = [], []
     for part in parts:
+        if _is_zero(part):
+            lines.append(
+                f"{_TWIST[part.what]} are zero in all {len(part.dt)} rows in which "
+                f"{part.what} change; expected NaN where they were not read"
+            )
+            continue
         lateness, ratio = _lateness(part), _ratio(part)
         # Between the two is decided by which leaves less unexplained.
         if ratio is not None and not (
@@ -117,6 +126,19 @@ def _lines(parts: list[Steps]) -> list[str]:
         f"lengths of steps varied by about {1e3 * jitter:.2g} ms; expected measured "
         "times in 'dt'"
     ]
+
+
+def _is_zero(steps: Steps) -> bool:
+    """Whether velocities are exactly zero while poses go somewhere.
+
+    Poses that are noise about one place have a range of three or four of their steps.
+    """
+    if len(steps.dt) < _FEWEST or np.any(steps.first) or np.any(steps.last):
+        return False
+    moved = steps.rate * steps.dt[:, None]
+    place = np.cumsum(moved, axis=0)
+    reach = np.linalg.norm(place.max(axis=0) - place.min(axis=0))
+    return bool(reach > _FAR * np.sqrt(np.mean(np.sum(moved**2, axis=1))))
 
 
 def _late_line(late: list[tuple[Steps, "_Late"]]) -> str:

@@ -144,6 +144,19 @@ def test_ratios_that_are_not_one_are_named(seed):
     assert "angles change 0.01" in reason
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_velocities_that_nobody_filled_in_are_named(seed):
+    """But not those of a body at rest, whose poses are noise about one place."""
+    states = pushed(seed) * [1.0, 1.0, 1.0, 0.0, 0.0, 0.0]
+    (linear, angular) = reasons_of(states)
+    expected = "are zero in all 60 rows in which positions change; expected NaN where"
+    assert linear.startswith(f"box: velocities {expected}")
+    assert angular.startswith("box: angular velocities are zero in all 60 rows")
+    rng = np.random.default_rng(seed)
+    resting = read(rng, np.zeros((200, 6))) * [1.0, 1.0, 1.0, 0.0, 0.0, 0.0]
+    assert reasons_of(resting) == []
+
+
 def test_wrapped_angles_are_in_order():
     states = pushed(3, 200, noise=0.1 * NOISE)
     states[:, 2] += 40.0 * DT * np.arange(len(states))
