@@ -5,8 +5,8 @@ in proportion to the concentration, times what the kind's other objects predict 
 (Neal (2000), algorithm 3). The means, structure and label probabilities of the kinds
 are integrated out; spreads are kept, and drawn given the objects. A new kind's spreads
 come from their prior, which is also what a lone object leaves them. Costs a batch of
-likelihoods, one of each chain, for each object. Prefer it to `stick_breaking` where
-objects say much: a new kind fits its first object.
+some hundred likelihoods for each object, and a few for whole kinds. Prefer it to
+`stick_breaking` where objects say much: a new kind fits its first object.
 """
 
 import numpy as np

@@ -3,7 +3,10 @@
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.drag_doubts import drag_reasons
 from boomdp_jax.inference.lever_doubts import lever_reasons
-from boomdp_jax.inference.pose_velocity_agreement import pose_velocity_reasons
+from boomdp_jax.inference.pose_velocity_agreement import (
+    pose_velocity_notes,
+    pose_velocity_reasons,
+)
 from boomdp_jax.inference.posterior import Posterior, with_diagnostics
 from boomdp_jax.inference.run_breaks import run_break_reasons
 from boomdp_jax.inference.stance_doubts import stance_reasons
@@ -45,5 +48,6 @@ def with_doubts(
         posterior = with_diagnostics(posterior, reasons)
     left_out = posterior.diagnostics.get("notes", [])
     still = still_notes(spec, history, left_out)
-    notes = [*unread_notes(spec, history), *still, *notes]
+    jitter = pose_velocity_notes(spec, history)
+    notes = [*unread_notes(spec, history), *still, *jitter, *notes]
     return with_notes(posterior, notes)

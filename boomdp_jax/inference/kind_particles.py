@@ -45,7 +45,7 @@ class Particles(NamedTuple):
 
     log_weight: np.ndarray
     side: np.ndarray
-    """Which of two kinds each object is of, `[..., N]`."""
+    """Which of two kinds the object of each step is of, `[..., step]`."""
     structure: np.ndarray
     z: np.ndarray
     log_likelihood: np.ndarray
@@ -170,11 +170,12 @@ def _run(
         add_object(data, state, i, -1.0)
         taken = np.flatnonzero((chosen > 0) & rows.is_member[:, i])
         chain = rows.chain[taken]
-        state.kind[chain, i] = rows.kinds[taken, best.side[taken, i]]
+        at = (taken, np.argmax(rows.order[taken] == i, axis=1))
+        state.kind[chain, i] = rows.kinds[taken, best.side[at]]
         if data.is_seen[i]:
-            state.structure[chain, i] = best.structure[taken, i]
-            state.z[chain, i] = best.z[taken, i]
-            state.log_likelihood[chain, i] = best.log_likelihood[taken, i]
+            state.structure[chain, i] = best.structure[at]
+            state.z[chain, i] = best.z[at]
+            state.log_likelihood[chain, i] = best.log_likelihood[at]
         add_object(data, state, i, 1.0)
     return float(np.mean(chosen > 0))
 
@@ -182,7 +183,7 @@ def _run(
 def _start(data, state: KindState, rows: _Rows, num_particles: int) -> Particles:
     """All members gone; what a kind had before stays in it."""
     shape = (len(rows.chain), num_particles)
-    num_objects, num_before = data.num_objects, state.before.num_slots
+    num_steps, num_before = rows.order.shape[1], state.before.num_slots
     is_known = np.flatnonzero(rows.kinds[:, 0] < num_before)
     tallies = []
     for known in state.before:
@@ -192,10 +193,10 @@ def _start(data, state: KindState, rows: _Rows, num_particles: int) -> Particles
         tallies.append(field)
     return Particles(
         np.zeros(shape),
-        np.zeros((*shape, num_objects), np.int8),
-        np.zeros((*shape, num_objects), int),
-        np.zeros((*shape, num_objects, data.dim)),
-        np.zeros((*shape, num_objects)),
+        np.zeros((*shape, num_steps), np.int8),
+        np.zeros((*shape, num_steps), int),
+        np.zeros((*shape, num_steps, data.dim)),
+        np.zeros((*shape, num_steps)),
         np.zeros(shape, bool),
         Tallies(*tallies),
     )
@@ -237,7 +238,8 @@ class _Part:
     ):
         num_particles = particles.log_weight.shape[1]
         mine = np.flatnonzero(rows.order[:, step] == i)
-        self.i, self._rows, self._shape = i, mine, (len(mine), num_particles)
+        self.i, self._step, self._rows = i, step, mine
+        self._shape = (len(mine), num_particles)
         tallies = Tallies(
             *(x[mine].reshape(-1, *x.shape[2:]) for x in particles.tallies)
         )
@@ -286,14 +288,14 @@ class _Part:
 
     def store(self, data: KindData, particles: Particles, log_likelihood) -> None:
         """Put the object into the particles, and weigh them."""
-        i, shape, rows = self.i, self._shape, self._rows
+        i, step, shape, rows = self.i, self._step, self._shape, self._rows
         cell = np.ix_(rows, np.arange(shape[1]))
         gain = np.nan_to_num(
             self.log_gain + log_likelihood, nan=-np.inf, posinf=-np.inf
         )
         particles.log_weight[rows] += gain.reshape(shape)
         side = self.side.reshape(shape)
-        particles.side[rows, :, i] = side
+        particles.side[rows, :, step] = side
         particles.is_split[rows] |= side == _SECOND
         place = (*cell, side)
         tallies = particles.tallies
@@ -308,9 +310,9 @@ class _Part:
             structure = self.structure.reshape(shape)
             tallies.structure[(*place, structure)] += 1.0
             has[..., : data.dim] = data.in_use[structure]
-            particles.structure[rows, :, i] = structure
-            particles.z[rows, :, i] = z
-            particles.log_likelihood[rows, :, i] = log_likelihood.reshape(shape)
+            particles.structure[rows, :, step] = structure
+            particles.z[rows, :, step] = z
+            particles.log_likelihood[rows, :, step] = log_likelihood.reshape(shape)
         else:
             has[..., : data.dim] = False
         first, second = data.coordinates.moments(value)

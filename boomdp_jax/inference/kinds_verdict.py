@@ -11,7 +11,10 @@ from boomdp_jax.core.history import History
 from boomdp_jax.inference.kind_objects import ObjectsAlone
 from boomdp_jax.inference.kinds_file import LearntKinds
 from boomdp_jax.inference.outliers import outlier_notes
-from boomdp_jax.inference.pose_velocity_agreement import pose_velocity_reasons
+from boomdp_jax.inference.pose_velocity_agreement import (
+    pose_velocity_notes,
+    pose_velocity_reasons,
+)
 from boomdp_jax.inference.posterior import Posterior, with_diagnostics
 from boomdp_jax.inference.run_breaks import run_break_reasons
 from boomdp_jax.inference.stance_doubts import stance_reasons
@@ -146,6 +149,7 @@ def with_kind_doubts(
         *_given_notes(prior_kinds),
         *posterior.diagnostics.get("notes", []),
         *unread_notes(spec, history),
+        *pose_velocity_notes(spec, used),
         *outlier_notes(spec, used, "write NaN in their place"),
     ]
     return with_diagnostics(posterior, reasons, {"notes": notes})

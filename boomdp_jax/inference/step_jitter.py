@@ -7,7 +7,7 @@ more the faster it moves, and turns farther as well. Noise of readings does neit
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from boomdp_jax.inference.outliers import SD_OF_MEDIAN
 from boomdp_jax.inference.pose_steps import (
@@ -23,16 +23,30 @@ from boomdp_jax.inference.pose_steps import (
 # Steps whose lengths vary by more than this share of themselves (one sd), and so many
 # sds of a rank correlation.
 _LEAST_JITTER, _SDS = 0.1, 4.0
+# More than this is no jitter: steps would be negative. Poses that are rounded to more
+# than a body moves in a row look so.
+_MOST_JITTER = 0.6
+# Share of rows in which a number does not change, from which poses are rounded so.
+_MOST_UNMOVED = 0.05
 # Rows in which velocity changes by more than so many times itself stop, start or hit
 # something: they say nothing of the length of a step.
-_STEADY = 0.5
+_STEADY = 0.2
 # Fewer rows tell nothing.
 _FEWEST = 16
 # How many times as fast the fastest third of rows has to be as the slowest.
 _LEAST_CONTRAST = 1.1
 
 
-def step_jitter(parts: list[Steps]) -> float | None:
+class Jitter(NamedTuple):
+    """Steps whose lengths vary."""
+
+    what: str
+    """By what it shows most: positions or angles."""
+    jitter: float
+    """One sd [s]."""
+
+
+def step_jitter(parts: list[Steps]) -> Jitter | None:
     """By how much lengths of steps vary, if they do.
 
     Three statistics are pooled: of positions and of angles, how much residuals grow
@@ -42,7 +56,7 @@ def step_jitter(parts: list[Steps]) -> float | None:
         parts: positions and angles of one body.
 
     Returns:
-        One sd [s]; None: no more than readings have by chance.
+        By how much; None: no more than readings have by chance.
     """
     found = [each for each in map(_growth, parts) if each is not None]
     sds = [each.sds for each in found]
@@ -51,12 +65,15 @@ def step_jitter(parts: list[Steps]) -> float | None:
     if not found or pooled_sds(sds) <= _SDS:
         return None
     best = max(found, key=lambda each: each.sds)
-    return best.jitter if best.share > _LEAST_JITTER else None
+    if not _LEAST_JITTER < best.share < _MOST_JITTER:
+        return None
+    return Jitter(best.what, best.jitter)
 
 
 class _Growth(NamedTuple):
     """How residuals along the motion grow with its speed."""
 
+    what: str
     sds: float
     share: float
     """Sd of a step's length, as a share of it."""
@@ -76,8 +93,11 @@ def _growth(steps: Steps) -> _Growth | None:
     """
     speed, change = norm_of(steps.beside), steps.half_change
     with np.errstate(invalid="ignore"):
-        use = (speed > 0.0) & (2.0 * norm_of(change) < _STEADY * speed)
+        is_steady = (speed > 0.0) & (2.0 * norm_of(change) < _STEADY * speed)
+    use = is_steady & _beside(steps, is_steady)
     if np.sum(use) < _FEWEST:
+        return None
+    if np.mean(steps.rate[use] == 0.0) > _MOST_UNMOVED:
         return None
     beside, speed = steps.beside[use], speed[use]
     rate, mean = steps.rate[use], steps.mean[use]
@@ -112,7 +132,15 @@ def _growth(steps: Steps) -> _Growth | None:
     more = max(spread[1] - spread[0], 0.0) / (far[1] - far[0])
     share = float(np.sqrt(more))
     jitter = share * float(np.median(steps.dt[use]))
-    return _Growth(sds, share, jitter, rest, steps.index[use])
+    return _Growth(steps.what, sds, share, jitter, rest, steps.index[use])
+
+
+def _beside(steps: Steps, is_steady: Bool[np.ndarray, " row"]) -> np.ndarray:
+    """Rows whose neighbours are steady as well: of a stop the rows before it too."""
+    follows = np.append(False, steps.run[1:] == steps.run[:-1])
+    before = ~follows | np.append(True, is_steady[:-1])
+    after = ~np.append(follows[1:], False) | np.append(is_steady[1:], True)
+    return before & after
 
 
 def _common(one: _Growth, other: _Growth) -> float:

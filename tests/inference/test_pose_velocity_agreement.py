@@ -5,7 +5,10 @@ import pytest
 
 from boomdp_jax.core.history import make_history
 from boomdp_jax.inference.kinds_verdict import with_kind_doubts
-from boomdp_jax.inference.pose_velocity_agreement import pose_velocity_reasons
+from boomdp_jax.inference.pose_velocity_agreement import (
+    pose_velocity_notes,
+    pose_velocity_reasons,
+)
 from tests.inference.posteriors import table_posterior
 from tests.inference.recordings import DT, INERTIA, MASS, NOISE, box_scene
 from tests.inference.residual_worlds import dry, nothing_else, viscous
@@ -39,10 +42,14 @@ def read(rng, states, noise=NOISE):
 
 
 def reasons_of(states, dt=DT, **options):
+    """Reasons for doubt; where there are none, notes."""
     rows = states[:, None]
     action = np.zeros((len(rows) - 1, 1, 3))
     history = make_history(rows[:-1], action, rows[1:], dt, **options)
-    return pose_velocity_reasons(box_scene(), history)
+    reasons = pose_velocity_reasons(box_scene(), history)
+    notes = pose_velocity_notes(box_scene(), history)
+    assert not (reasons and notes)
+    return reasons + notes
 
 
 def pushed(seed, num=60, force=nothing_else, noise=NOISE, **options):
@@ -113,7 +120,7 @@ def test_differences_to_both_sides_are_in_order(seed):
 @pytest.mark.parametrize("seed", range(5))
 def test_single_steps_of_a_simulator_are_named(seed):
     (reason,) = reasons_of(pushed(seed, noise=0.1 * NOISE, substeps=1))
-    assert "or rows are single steps of a simulator (they fit about" in reason
+    assert "or rows are few steps of a simulator (they fit about" in reason
     assert 8.0 < float(reason.split("about ")[1].split(" ms")[0]) < 13.0
     for noise in NOISES.values():
         assert reasons_of(pushed(seed, noise=noise, substeps=10)) == []
@@ -183,6 +190,25 @@ def test_uneven_steps_told_as_even_are_named(seed, noise):
     about = float(reason.split("about ")[1].split(" ms")[0])
     assert 0.5 < about / (1e3 * dt.std()) < 2.0
     assert reasons_of(states, dt) == []
+
+
+def test_poses_that_are_rounded_to_more_than_a_step_are_no_jitter():
+    for seed in range(10):
+        states = 0.05 * pushed(seed, 200, viscous(6.0), NOISES["exact"])
+        states[:, :3] = np.round(states[:, :3] / 5e-3) * 5e-3
+        assert reasons_of(states) == []
+
+
+def test_going_round_fast_is_no_other_unit():
+    """The way is shorter than the velocities at both ends say."""
+    rng = np.random.default_rng(0)
+    for rate in (20.0, 30.0):
+        spin = rate * (1.0 + 0.1 * rng.standard_normal(61))
+        angle = np.append(0.0, np.cumsum(0.5 * (spin[1:] + spin[:-1]) * DT * 2.5))
+        around = 0.3 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        along = spin[:, None] * around[:, ::-1] * [-1.0, 1.0]
+        states = np.column_stack([around, angle, along, spin])
+        assert reasons_of(read(rng, states), 2.5 * DT) == []
 
 
 def test_what_was_not_read_is_not_compared():
