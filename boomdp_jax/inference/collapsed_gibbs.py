@@ -12,7 +12,11 @@ some hundred likelihoods for each object, and a few for whole kinds. Prefer it t
 import numpy as np
 
 from boomdp_jax.inference.concentration import draw_concentration
-from boomdp_jax.inference.kind_particles import regather_kinds, split_or_merge_kinds
+from boomdp_jax.inference.kind_particles import (
+    draw_spreads_given,
+    regather_kinds,
+    split_or_merge_kinds,
+)
 from boomdp_jax.inference.kind_shift import shift_kinds
 from boomdp_jax.inference.kind_state import (
     KindData,
@@ -90,9 +94,9 @@ def sweep_collapsed(
 
 def draw_spreads(rng: np.random.Generator, data: KindData, state: KindState) -> None:
     """Spreads of all kinds given their objects; of empty ones from the prior."""
-    tallies, model = state.tallies, data.coordinates
-    log_weight = model.log_marginal(tallies.num, tallies.first, tallies.second)
-    state.spread[:] = draw_index(rng, log_weight + model.log_weight)
+    tallies = state.tallies
+    sums = (tallies.num, tallies.first, tallies.second)
+    state.spread[:] = draw_spreads_given(rng, data.coordinates, sums)
 
 
 def _with_room(rng: np.random.Generator, data: KindData, state: KindState) -> KindState:

@@ -112,6 +112,14 @@ class CoordinateModel:
             )
         return out
 
+    def log_over_spreads(
+        self, num: np.ndarray, first: np.ndarray, second: np.ndarray
+    ) -> np.ndarray:
+        """The same with the spread integrated out too, `[..., D]`."""
+        each = self.log_marginal(num, first, second) + self.log_weight
+        highest = each.max(axis=-1)
+        return highest + np.log(np.exp(each - highest[..., None]).sum(axis=-1))
+
     @functools.cached_property
     def angle_concentration(self) -> np.ndarray:
         """Of each angle's von Mises distribution, `[angle, G]`."""

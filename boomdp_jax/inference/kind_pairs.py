@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from boomdp_jax.inference.kind_coordinates import CoordinateModel, wrap
+from boomdp_jax.inference.kind_coordinates import wrap
 from boomdp_jax.inference.kind_state import KindData, label_base
 from boomdp_jax.inference.likelihood_bumps import (
     Bumps,
@@ -58,17 +58,10 @@ def _of_labels(data: KindData) -> np.ndarray:
 def _of_features(data: KindData) -> np.ndarray:
     model = data.coordinates.part(data.dim, data.coordinates.dim)
     first, second = model.moments(data.feature)
-    one = _log_marginal(model, np.ones_like(first), first, second)
+    one = model.log_over_spreads(np.ones_like(first), first, second).sum(axis=-1)
     sums = (first[:, None] + first, second[:, None] + second)
-    two = _log_marginal(model, np.full_like(sums[0], 2.0), *sums)
+    two = model.log_over_spreads(np.full_like(sums[0], 2.0), *sums).sum(axis=-1)
     return two - one[:, None] - one
-
-
-def _log_marginal(model: CoordinateModel, num, first, second) -> np.ndarray:
-    each = model.log_marginal(num, first, second) + model.log_weight
-    highest = each.max(axis=-1, keepdims=True)
-    total = highest[..., 0] + np.log(np.exp(each - highest).sum(axis=-1))
-    return total.sum(axis=-1)
 
 
 class _Alone(NamedTuple):

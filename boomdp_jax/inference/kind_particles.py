@@ -17,11 +17,13 @@ before it a kind's spreads are auxiliary to the next object, which then has, the
 integrated out, its exact conditional density.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
+from boomdp_jax.inference.kind_coordinates import CoordinateModel
 from boomdp_jax.inference.kind_state import (
     KindData,
     KindState,
@@ -264,7 +266,7 @@ class _Part:
             return
         model, dim = data.coordinates.part(0, data.dim), data.dim
         sums = [x[..., :dim] for x in tallies[3:]]
-        spread = _draw_spreads(rng, model, sums)
+        spread = draw_spreads_given(rng, model, sums)
         own_points = np.flatnonzero(is_own)
         own_spread = _spreads_with(
             rng, data, model, sums, own_points, side, structure, z
@@ -338,20 +340,24 @@ def _log_sides(data, tallies: Tallies, i, log_alpha, is_split, step) -> np.ndarr
         value = np.broadcast_to(data.feature[i], old[0].shape)
         first, second = part.moments(value)
         new = (old[0] + 1.0, old[1] + first, old[2] + second)
-        gain = _log_marginal(part, new) - _log_marginal(part, old)
+        gain = part.log_over_spreads(*new) - part.log_over_spreads(*old)
         out = out + gain.sum(axis=-1)
     return out
 
 
-def _log_marginal(model, sums) -> np.ndarray:
-    """With the spreads integrated out, `[..., D]`."""
-    each = model.log_marginal(*sums) + model.log_weight
-    highest = each.max(axis=-1)
-    return highest + np.log(np.exp(each - highest[..., None]).sum(axis=-1))
+def draw_spreads_given(
+    rng: np.random.Generator, model: CoordinateModel, sums: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Which spread each coordinate has, given the objects of a kind.
 
+    Args:
+        rng: source of randomness.
+        model: of the coordinates, `D` of them.
+        sums: `num`, `first` and `second` of `Tallies`, `[..., D]` each.
 
-def _draw_spreads(rng, model, sums) -> np.ndarray:
-    """Spreads given objects, `[..., D]`."""
+    Returns:
+        Indices, `[..., D]`.
+    """
     return draw_index(rng, model.log_marginal(*sums) + model.log_weight)
 
 
@@ -361,7 +367,9 @@ def _spreads_with(rng, data, model, sums, points, side, structure, z) -> np.ndar
     has = data.in_use[structure[points]]
     first, second = model.moments(z[points])
     more = (has.astype(float), np.where(has, first, 0.0), np.where(has, second, 0.0))
-    return _draw_spreads(rng, model, [a + b for a, b in zip(own, more, strict=True)])
+    return draw_spreads_given(
+        rng, model, [a + b for a, b in zip(own, more, strict=True)]
+    )
 
 
 def _resample(rng, particles: Particles) -> Particles:

@@ -215,12 +215,8 @@ def log_coordinates(data: KindData, tallies: Tallies) -> np.ndarray:
     Returns:
         One number for each, `[chain, kind]`.
     """
-    model = data.coordinates
-    each = model.log_marginal(tallies.num, tallies.first, tallies.second)
-    each = each + model.log_weight
-    highest = each.max(axis=-1)
-    total = highest + np.log(np.exp(each - highest[..., None]).sum(axis=-1))
-    return total.sum(axis=-1)
+    sums = (tallies.num, tallies.first, tallies.second)
+    return data.coordinates.log_over_spreads(*sums).sum(axis=-1)
 
 
 def _lgamma(x: np.ndarray) -> np.ndarray:
