@@ -4,7 +4,8 @@ Objects of all families move by our own engine and are read with noise of 0 to 1
 each channel's spread, in every second the motion is disturbed as well; what they are is
 inferred from scratch. No alarm is right. Then boxes obey a further law (drag, dry
 friction, a slope, a force off the centre of mass, another inertia), which has to be
-named; a free box's model knows none of them.
+named; a free box's model knows none of them. Last, wrenches are written down a row late
+or early, as where a loop logs the command of the step before.
 """
 
 import _repository  # noqa: F401
@@ -13,12 +14,13 @@ import numpy as np
 from _noisy_objects import make_noisy_object
 from _report import Reporter, parser_of
 
+from boomdp_jax.core.history import make_history
 from boomdp_jax.inference.infer import infer_batch
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.residual_report import FALSE_ALARMS
 from boomdp_jax.interop.object_families import FAMILIES, hide
 from tests.inference import residual_worlds as worlds
-from tests.inference.recordings import box_scene
+from tests.inference.recordings import DT, box_scene
 
 LEVELS = (0.0, 0.002, 0.01, 0.05, 0.15)
 _LEAST_NOISE = 1e-6
@@ -46,6 +48,7 @@ def main() -> None:
     reporter = Reporter(arguments.out)
     report_honest(reporter, arguments)
     report_laws(reporter, arguments)
+    report_rows_apart(reporter, arguments)
     reporter.print_table()
 
 
@@ -147,6 +150,37 @@ def report_laws(reporter: Reporter, arguments) -> None:
                 value=float(np.sqrt(np.mean(score**2))),
                 n=len(found),
             )
+
+
+def report_rows_apart(reporter: Reporter, arguments) -> None:
+    """Boxes whose wrenches stand a row later or earlier than they acted."""
+    ways = {"advance": 1, "delay": -1}
+    cases = []
+    for name, num_late in ways.items():
+        for i in range(arguments.boxes):
+            rng = np.random.default_rng([37, max(num_late, 0), i])
+            state, action, next_state = worlds.box_table(rng, 101)
+            written = np.roll(action, num_late, axis=0)
+            # The row that has no wrench of its own is left out.
+            rows = slice(1, None) if num_late > 0 else slice(None, -1)
+            parts = (part[rows][:, None] for part in (state, written, next_state))
+            cases.append((name, make_history(*parts, DT)))
+    posteriors = infer_batch(
+        jax.random.key(arguments.seed + 2),
+        [box_scene()] * len(cases),
+        [history for _, history in cases],
+    )
+    for name, num_late in ways.items():
+        mine = [p for (n, _), p in zip(cases, posteriors, strict=True) if n == name]
+        named = [names_a_law(p) and best_of(p)["law"] == name for p in mine]
+        reporter.report(
+            case=f"boxes with wrenches a row {'late' if num_late > 0 else 'early'}",
+            metric=f"share of which {name} is named",
+            value=float(np.mean(named)),
+            n=len(mine),
+            target=1.0,
+            met=bool(np.all(named)),
+        )
 
 
 if __name__ == "__main__":

@@ -246,8 +246,9 @@ class _Block:
         variance = np.diagonal(self._filtered.after.covariance, axis1=1, axis2=2)
         spread = np.sqrt(np.asarray(variance, float)).reshape(shape)
         change = np.diff(self._wrench, axis=0, prepend=self._wrench[:1])
-        change = change / self._dt[:, None, None]
         change[np.asarray(self._data.is_start) > 0] = 0.0
+        ahead = np.roll(change, -1, axis=0) / self._dt[:, None, None]
+        change = change / self._dt[:, None, None]
         length = np.where(np.asarray(self._data.is_used) > 0, self._dt, 0.0)
         progress = (np.cumsum(length) - 0.5 * length) / np.sum(length) - 0.5
         paths = []
@@ -255,7 +256,7 @@ class _Block:
             own = spread[:, body]
             both = np.column_stack([np.hypot(own[:, 3], own[:, 4]), own[:, 5]])
             place = middle[:, body]
-            applied = (self._wrench[:, body], change[:, body])
+            applied = (self._wrench[:, body], change[:, body], ahead[:, body])
             rest = (both, progress)
             paths.append(Path(place[:, :3], place[:, 3:], *applied, *rest))
         return paths

@@ -19,7 +19,9 @@ class Path(NamedTuple):
     wrench: Float[np.ndarray, "time 3"]
     """As the model has it act, world frame [N, N, N m]."""
     change: Float[np.ndarray, "time 3"]
-    """Of the wrench from step to step, per second; none where a run begins."""
+    """Of the wrench from the step before, per second; none where a run begins."""
+    change_ahead: Float[np.ndarray, "time 3"]
+    """Of the wrench to the step after, per second; none where a run ends."""
     spread: Float[np.ndarray, "time 2"]
     """How well velocity [m/s] and spin [rad/s] are known."""
     progress: Float[np.ndarray, " time"]
@@ -166,6 +168,14 @@ LAWS: tuple[Law, ...] = (
         "the applied wrench as it was before, by",
         "s",
         lambda p: [-p.change],
+    ),
+    # Where wrenches are held over several steps the two differ: one says what acts in
+    # the first step of a push, the other in the step before it.
+    Law(
+        "advance",
+        "the applied wrench as it comes to be only in later rows, ahead by",
+        "s",
+        lambda p: [p.change_ahead],
     ),
     Law(
         "lever",

@@ -233,6 +233,22 @@ def test_commands_that_come_late_are_a_delay():
 
 
 @pytest.mark.slow
+def test_commands_that_are_recorded_late_are_an_advance():
+    """By 8 ms of steps of 20 ms: part of each wrench is the one after, in two runs."""
+    table = worlds.box_table(np.random.default_rng(13), 100)
+    state, acted, next_state = table
+    share, given = 0.4, np.zeros_like(acted)
+    episode = np.arange(100) // 50
+    for row in reversed(range(len(acted))):
+        has_next = row + 1 < len(acted) and episode[row + 1] == episode[row]
+        later = given[row + 1] if has_next else acted[row]
+        given[row] = (acted[row] - share * later) / (1.0 - share)
+    rows = (part[:, None] for part in (state, given, next_state))
+    (found,) = check([make_history(*rows, DT, episode=episode)])
+    assert_names(found, "advance", [share * DT])
+
+
+@pytest.mark.slow
 def test_a_mass_that_grows_while_it_is_pushed_is_a_drift():
     """Commands do a tenth more at the begin than the model says, later less."""
     table = worlds.box_table(np.random.default_rng(12), 100)

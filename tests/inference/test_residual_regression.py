@@ -144,7 +144,7 @@ def test_correlated_innovations_do_not_pass_and_few_are_not_judged():
 def random_path(rng) -> Path:
     shape = (30, 3)
     progress = (np.arange(30) + 0.5) / 30 - 0.5
-    return Path(*rng.normal(size=(4, *shape)), np.full((30, 2), 1e-3), progress)
+    return Path(*rng.normal(size=(5, *shape)), np.full((30, 2), 1e-3), progress)
 
 
 def test_laws_of_the_bodys_own_frame_turn_with_the_world():
@@ -158,6 +158,7 @@ def test_laws_of_the_bodys_own_frame_turn_with_the_world():
         path.twist @ turn.T,
         path.wrench @ turn.T,
         path.change @ turn.T,
+        path.change_ahead @ turn.T,
         path.spread,
         path.progress,
     )
