@@ -14,39 +14,43 @@ static models; Gilks and Berzuini (2001), Following a moving target.
 """
 
 import functools
+import os
 import time
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from boomdp_jax.core.arrays import BoolScalar, Key, on_device, row_of
+from boomdp_jax.core.arrays import BoolScalar, Key, on_device
 from boomdp_jax.core.checked_input import positive_seconds, whole_number
-from boomdp_jax.core.history import History, make_history
-from boomdp_jax.core.quick_compile import QuickCompile
+from boomdp_jax.core.history import History
 from boomdp_jax.inference.arguments import check_history
-from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.compile_ahead import signature
 from boomdp_jax.inference.components import independent_blocks
 from boomdp_jax.inference.doubts import with_doubts
 from boomdp_jax.inference.online_check import check_online
+from boomdp_jax.inference.online_file import (
+    read_belief,
+    settings_for_file,
+    write_belief,
+)
 from boomdp_jax.inference.online_fit import make_online_block, refit_settings
+from boomdp_jax.inference.online_groups import BlockGroups
 from boomdp_jax.inference.online_posterior import (
     best_params,
     online_params,
     online_posterior,
     structure_share,
 )
-from boomdp_jax.inference.online_refit import (
-    RefitInfo,
-    prior_belief,
-    refit_block,
+from boomdp_jax.inference.online_refit import RefitInfo, prior_belief, refit_block
+from boomdp_jax.inference.online_refresh import (
+    LEAVING_SHARE,
+    OnlineInfo,
+    compiled_refresh,
 )
-from boomdp_jax.inference.online_refresh import LEAVING_SHARE, OnlineInfo, refresh
-from boomdp_jax.inference.online_rows import step_length, table_of
+from boomdp_jax.inference.online_rows import empty_table, step_length, table_of
 from boomdp_jax.inference.online_state import BeliefState, BlockBelief
 from boomdp_jax.inference.online_warm_up import try_out
 from boomdp_jax.inference.posterior import Posterior
@@ -69,14 +73,6 @@ class Observed(NamedTuple):
 
     step: OnlineInfo
     refit: RefitInfo | None
-
-
-@functools.lru_cache(maxsize=64)
-def _compiled_step(
-    bodies: tuple[tuple[tuple[int, ...], ...], ...], forgetting: float
-) -> QuickCompile:
-    """`refresh` of blocks by groups; beliefs of equal shapes share its programs."""
-    return QuickCompile(functools.partial(refresh, bodies, forgetting))
 
 
 class OnlineBelief:
@@ -141,31 +137,24 @@ class OnlineBelief:
         self.capacity = whole_number("capacity", capacity, LEAVING_SHARE)
         self.spec = spec
         self._dt = positive_seconds("dt", spec.dt if dt is None else dt)
-        none = np.zeros((0, spec.num_bodies, 6))
-        history = make_history(none, none[..., :3], none, self._dt, capacity=capacity)
-        self._empty = eqx.tree_at(
-            lambda h: h.dt, history, on_device(np.full(capacity, self._dt))
-        )
+        self._empty = empty_table(spec.num_bodies, self.capacity, self._dt)
         seen = self._empty if screen is None else screen
         check_history(spec, seen, "screen")
-        self._blocks = [
-            make_online_block(self._settings, bodies, self._empty)
-            for bodies in independent_blocks(spec, seen, is_complete=False)[0]
-        ]
-        groups: dict[object, list[int]] = {}
-        for index, block in enumerate(self._blocks):
-            groups.setdefault(signature(block.target), []).append(index)
-        self._groups = list(groups.values())
-        bodies = [[self._blocks[index].bodies for index in g] for g in self._groups]
-        self._step = _compiled_step(tuple(map(tuple, bodies)), float(forgetting))
+        self._groups = BlockGroups.of(
+            [
+                make_online_block(self._settings, bodies, self._empty)
+                for bodies in independent_blocks(spec, seen, is_complete=False)[0]
+            ]
+        )
+        self._step = compiled_refresh(self._groups.bodies, float(forgetting))
 
     @property
     def blocks(self) -> list[tuple[str, ...]]:
         """Names of the bodies of each block, in the order in which infos list them."""
         return [
-            tuple(self.spec.names[body] for body in self._blocks[index].bodies)
-            for group in self._groups
-            for index in group
+            tuple(self.spec.names[body] for body in bodies)
+            for group in self._groups.bodies
+            for bodies in group
         ]
 
     def init(self, key: Key, history: History | None = None) -> BeliefState:
@@ -193,7 +182,7 @@ class OnlineBelief:
             index: prior_belief(
                 jax.random.fold_in(prior_key, index), self._settings, block
             )
-            for index, block in enumerate(self._blocks)
+            for index, block in enumerate(self._groups.blocks)
         }
         integer = jnp.zeros((), int).dtype
         state = BeliefState(
@@ -203,7 +192,7 @@ class OnlineBelief:
             num_seen=on_device(num_rows, integer),
             refit_at=on_device(_FIRST_REFIT, integer),
             refit_after=on_device(_REST, integer),
-            blocks=self._stacked(beliefs),
+            blocks=self._groups.stacked(beliefs),
         )
         return self.refit(state)[0] if num_rows else state
 
@@ -288,17 +277,17 @@ class OnlineBelief:
         num_rows = int(belief.num_rows)
         beliefs: dict[int, BlockBelief] = {}
         found = []
-        for group, stacked in zip(self._groups, belief.blocks, strict=True):
-            for place, index in enumerate(group):
-                beliefs[index], info = refit_block(
-                    jax.random.fold_in(refit_key, index),
-                    self._settings,
-                    row_of(stacked, place),
-                    self._blocks[index].bodies,
-                    belief.history,
-                    num_rows,
-                )
-                found.append(info)
+        parts = zip(self._groups.order, self._groups.parts(belief.blocks), strict=True)
+        for index, (block, before) in parts:
+            beliefs[index], info = refit_block(
+                jax.random.fold_in(refit_key, index),
+                self._settings,
+                before,
+                block.bodies,
+                belief.history,
+                num_rows,
+            )
+            found.append(info)
         latest = max((int(b.begin) for b in beliefs.values()), default=0)
         integer, used = belief.num_seen.dtype, num_rows - latest
         num_seen = int(belief.num_seen)
@@ -309,7 +298,7 @@ class OnlineBelief:
             belief,
             (
                 key,
-                self._stacked(beliefs),
+                self._groups.stacked(beliefs),
                 on_device(num_seen + wait, integer),
                 on_device(num_seen + rest, integer),
             ),
@@ -330,7 +319,7 @@ class OnlineBelief:
         """
         most = self.capacity if num_rows is None else num_rows
         most = whole_number("num_rows", most, 1)
-        targets = [block.target for block in self._blocks]
+        targets = [block.target for block in self._groups.blocks]
         sizes = self.capacity, self._settings.num_particles, self._settings.num_levels
         name = signature(targets), self._step, sizes
         try_out(self, name, None if self._settings.is_uniform else self._dt, most)
@@ -345,11 +334,11 @@ class OnlineBelief:
                 takes a refit's time.
         """
         key = jax.random.fold_in(belief.key, 1)
-        laws = None
+        parts, laws = self._groups.parts(belief.blocks), None
         if check:
             known = self._settings, belief.history, int(belief.num_rows)
             laws = functools.partial(check_online, *known)
-        posterior = online_posterior(key, self.spec, self._parts(belief), laws)
+        posterior = online_posterior(key, self.spec, parts, laws)
         if not check:
             return posterior
         return with_doubts(posterior, self.spec, belief.history, [])
@@ -369,32 +358,43 @@ class OnlineBelief:
             ValueError: a number of samples that is no whole number or under one.
         """
         num_samples = whole_number("num_samples", num_samples, 1)
-        return online_params(key, self.spec, self._parts(belief), num_samples)
+        parts = self._groups.parts(belief.blocks)
+        return online_params(key, self.spec, parts, num_samples)
 
     def best_params(self, belief: BeliefState) -> Params:
         """The most probable structure's most probable numbers; on the host."""
-        return best_params(self.spec, self._parts(belief))
+        return best_params(self.spec, self._groups.parts(belief.blocks))
 
     def structure_share(self, belief: BeliefState) -> float:
         """Probability of the most probable structure, the least over blocks."""
-        return structure_share(self._parts(belief))
+        return structure_share(self._groups.parts(belief.blocks))
 
-    def _parts(self, belief: BeliefState) -> list[tuple[Block, BlockBelief]]:
-        """Blocks, and what is believed of each."""
-        return [
-            (self._blocks[index], row_of(stacked, place))
-            for group, stacked in zip(self._groups, belief.blocks, strict=True)
-            for place, index in enumerate(group)
-        ]
+    def save(self, belief: BeliefState, path: str | os.PathLike) -> None:
+        """Write a belief to an NPZ file, the whole of it or nothing; `load` reads it.
 
-    def _stacked(self, beliefs: dict[int, BlockBelief]) -> tuple[BlockBelief, ...]:
-        """Blocks of equal shapes side by side."""
-        return tuple(
-            jax.tree.map(
-                lambda *leaves: jax.device_put(
-                    np.stack([np.asarray(leaf) for leaf in leaves])
-                ),
-                *(beliefs[index] for index in group),
-            )
-            for group in self._groups
-        )
+        Args:
+            belief: so far.
+            path: the file.
+        """
+        write_belief(path, self._for_file(), belief)
+
+    def load(self, path: str | os.PathLike) -> BeliefState:
+        """Read a belief that `save` wrote, here or in another process.
+
+        Args:
+            path: the file.
+
+        Returns:
+            The belief; what follows is the same to the bit as if it had gone on.
+
+        Raises:
+            ValueError: not such a file, a damaged one, or one of an `OnlineBelief` of
+                another scene or with other settings, the first of which is named.
+            OSError: the file cannot be opened.
+        """
+        begin = functools.partial(self.init, jax.random.key(0))
+        return read_belief(path, self._for_file(), begin)
+
+    def _for_file(self) -> dict:
+        sizes = self.capacity, self._dt, self.blocks
+        return settings_for_file(self._settings, *sizes)

@@ -1,5 +1,6 @@
 """One transition into the belief about a whole scene: the table, and every block."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar
+from boomdp_jax.core.quick_compile import QuickCompile
 from boomdp_jax.inference.online_rows import append_row, can_happen, new_row, shift_rows
 from boomdp_jax.inference.online_state import BeliefState
 from boomdp_jax.inference.online_step import (
@@ -49,6 +51,14 @@ class OnlineInfo(NamedTuple):
     """Rows in the table after the step."""
     num_left: IntScalar
     """Oldest rows that left a full table in this step."""
+
+
+@functools.lru_cache(maxsize=64)
+def compiled_refresh(
+    groups: tuple[tuple[tuple[int, ...], ...], ...], forgetting: float
+) -> QuickCompile:
+    """`refresh` of blocks by groups; beliefs of equal shapes share its programs."""
+    return QuickCompile(functools.partial(refresh, groups, forgetting))
 
 
 def refresh(

@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar, on_device
 from boomdp_jax.core.checked_input import positive_seconds
-from boomdp_jax.core.history import History, is_read_anew
+from boomdp_jax.core.history import History, is_read_anew, make_history
 from boomdp_jax.inference.track_data import TrackData, TrackRow
 
 
@@ -27,6 +28,19 @@ class NewRow(NamedTuple):
     is_chained: BoolScalar
     is_start_new: Bool[Array, "body 6"]
     """As `History` has them."""
+
+
+def empty_table(num_bodies: int, capacity: int, dt: float) -> History:
+    """A table of no transitions yet, with room for some.
+
+    Args:
+        num_bodies: of the scene.
+        capacity: rows there is room for.
+        dt: usual length of a step [s].
+    """
+    none = np.zeros((0, num_bodies, 6))
+    history = make_history(none, none[..., :3], none, dt, capacity=capacity)
+    return eqx.tree_at(lambda h: h.dt, history, on_device(np.full(capacity, dt)))
 
 
 def can_happen(action: Float[Array, "body 3"], dt: FloatScalar) -> BoolScalar:
