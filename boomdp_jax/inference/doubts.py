@@ -1,8 +1,13 @@
 """What is said of a posterior besides what its own draws and filters tell."""
 
+import numpy as np
+
 from boomdp_jax.core.history import History
+from boomdp_jax.inference.angle_sense import angle_sense_reasons
 from boomdp_jax.inference.drag_doubts import drag_reasons
+from boomdp_jax.inference.known_joints import known_joint_reasons
 from boomdp_jax.inference.lever_doubts import lever_reasons
+from boomdp_jax.inference.noise_doubts import noise_reasons
 from boomdp_jax.inference.pose_velocity_agreement import (
     pose_velocity_notes,
     pose_velocity_reasons,
@@ -35,9 +40,18 @@ def with_doubts(
         history: its readings.
         notes: further ones.
     """
+    impulse = posterior.impulse_scale
+    noise = (
+        np.asarray(posterior.noise_scale, float),
+        np.asarray(posterior.prior_noise_scale, float),
+        None if impulse is None else np.asarray(impulse, float),
+    )
     reasons = [
         *run_break_reasons(spec, history),
         *pose_velocity_reasons(spec, history),
+        *angle_sense_reasons(spec, history),
+        *known_joint_reasons(spec, history),
+        *noise_reasons(spec, history, *noise),
         *lever_reasons(spec, posterior),
         *angle_reasons(spec, history, posterior),
         *stance_reasons(spec, posterior),

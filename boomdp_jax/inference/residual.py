@@ -28,6 +28,7 @@ from boomdp_jax.inference.residual_laws import LAWS, Law, Path
 from boomdp_jax.inference.residual_regression import (
     LawFit,
     absorb,
+    correlation,
     fit_law,
     whiteness,
 )
@@ -76,6 +77,8 @@ class ResidualCheck(NamedTuple):
     """Of each body, p-value by channel group."""
     growth: tuple[SpreadGrowth | None, ...] = ()
     """Of each body, whether its readings err more the faster it moves."""
+    correlation: tuple[dict[str, float], ...] = ()
+    """Of each body, of innovations one after the other, by the same groups."""
 
 
 def check_residuals(targets: StructureTarget, draws: BlockDraws) -> list[ResidualCheck]:
@@ -191,7 +194,8 @@ class _Block:
                 found.append(BodyLaw(body, law, fit))
         found.sort(key=lambda one: -one.fit.log_bayes_factor)
         growth = self._growth(base, counts, paths)
-        return ResidualCheck(len(rows), found, self._whiteness(base, counts), growth)
+        white, correlated = self._whiteness(base, counts)
+        return ResidualCheck(len(rows), found, white, growth, correlated)
 
     def _counts(self) -> np.ndarray:
         counts = self._filtered.gains.counts
@@ -318,11 +322,13 @@ class _Block:
             for body, path in enumerate(paths)
         )
 
-    def _whiteness(self, base: np.ndarray, counts: np.ndarray) -> list[dict]:
+    def _whiteness(
+        self, base: np.ndarray, counts: np.ndarray
+    ) -> tuple[list[dict[str, float]], tuple[dict[str, float], ...]]:
         track = np.cumsum(np.asarray(self._data.is_start) > 0)
-        found = []
+        found, correlated = [], []
         for body in range(base.shape[2]):
-            each = {}
+            each, both = {}, {}
             for name, group in zip(CHANNELS, _GROUPS, strict=True):
                 channels = list(group)
                 error = base[:, 1, body, channels]
@@ -332,8 +338,10 @@ class _Block:
                 value = whiteness(error, seen, track) if is_full else None
                 if value is not None:
                     each[name] = value
+                    both[name] = correlation(error, seen, track)
             found.append(each)
-        return found
+            correlated.append(both)
+        return found, tuple(correlated)
 
 
 def _length(change: np.ndarray) -> np.ndarray:

@@ -83,6 +83,28 @@ def _constant(path: Path, part: int) -> np.ndarray:
     return np.tile(np.eye(3)[part], (len(path.pose), 1))
 
 
+def _limited(part: np.ndarray, place: int = 0) -> np.ndarray:
+    """What a limit takes away from a part of the wrench, but for a share of the part.
+
+    The hyperbolic tangent of its size by the root mean square of sizes, less the share
+    of the part that is most like it, which is a matter of the mass. Of commands that
+    are normal it has 0.76 to 0.97 of the variance of what limits of half to one and a
+    half times that size leave so.
+
+    Args:
+        part: components that are limited together, `[time, component]`.
+        place: of the first of them in a wrench.
+    """
+    size = np.linalg.norm(part, axis=1)
+    acts = size > 0.0
+    usual = np.sqrt(np.mean(size[acts] ** 2)) if np.any(acts) else 1.0
+    share = np.where(acts, np.tanh(size / usual) * usual / np.where(acts, size, 1.0), 0)
+    share = share - np.sum(share * size**2) / max(float(size @ size), 1e-300)
+    wrench = np.zeros((len(part), 3))
+    wrench[:, place : place + part.shape[1]] = part * share[:, None]
+    return wrench
+
+
 def _own_axis_law(letter: str, number: int) -> tuple[Law, Law]:
     """Friction along one of the body's axes, and another mass along it."""
     return (
@@ -152,6 +174,27 @@ LAWS: tuple[Law, ...] = (
         "a further share of the applied torque",
         "",
         lambda p: [_torque(p.wrench[:, 2])],
+    ),
+    Law(
+        "force_limit",
+        "more of small forces and less of large ones than of usual ones, as where what "
+        "acts is limited (the other way round if negative), a share of",
+        "",
+        lambda p: [_limited(p.wrench[:, :2])],
+    ),
+    Law(
+        "axis_limit",
+        "more of small components of forces and less of large ones, as where each is "
+        "limited by itself (the other way round if negative), a share of",
+        "",
+        lambda p: [_limited(p.wrench[:, :1]) + _limited(p.wrench[:, 1:2], 1)],
+    ),
+    Law(
+        "torque_limit",
+        "more of small torques and less of large ones than of usual ones, as where "
+        "what acts is limited (the other way round if negative), a share of",
+        "",
+        lambda p: [_limited(p.wrench[:, 2:], 2)],
     ),
     Law(
         "drift",

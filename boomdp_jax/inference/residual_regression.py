@@ -177,6 +177,17 @@ def whiteness(
     return _chi_square_tail(total, num) if num else None
 
 
+def correlation(
+    innovation: Float[np.ndarray, "time channel"],
+    counts: Float[np.ndarray, "time channel"],
+    track: Int[np.ndarray, " time"],
+) -> float:
+    """Of innovations with those one reading before; arguments as of `whiteness`."""
+    value = np.where(counts > 0, innovation, 0.0)
+    pairs = (value[1:] * value[:-1])[track[1:] == track[:-1]]
+    return float(np.sum(pairs)) / max(float(np.sum(value**2)), 1e-300)
+
+
 def _chi_square_tail(value: float, num: int) -> float:
     """Probability of a chi-square of `num` degrees of freedom beyond a value."""
     half = 0.5 * value

@@ -249,6 +249,36 @@ def test_commands_that_are_recorded_late_are_an_advance():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["axis_limit", "torque_limit", "force_limit"])
+def test_commands_that_are_cut_off_are_a_limit(name):
+    """At 1.2 of their sd; what a mass would explain is taken into account."""
+    state, acted, next_state = worlds.box_table(np.random.default_rng(14), 100)
+    usual = np.array([20.0, 20.0, 3.0])
+    given = acted.copy()
+    # What acts is within limits already, as the command beyond it does nothing more.
+    rng = np.random.default_rng(15)
+    bold = rng.uniform(1.0, 3.0, size=len(given))
+    if name == "axis_limit":
+        over = np.abs(acted[:, :2]) > 1.2 * usual[:2]
+        given[:, :2] *= np.where(over, bold[:, None], 1.0)
+    elif name == "torque_limit":
+        given[:, 2] *= np.where(np.abs(acted[:, 2]) > 1.2 * usual[2], bold, 1.0)
+    else:
+        over = np.hypot(*acted[:, :2].T) > 1.2 * usual[0]
+        given[:, :2] *= np.where(over, bold, 1.0)[:, None]
+    # The mass is known here, so gains would show first: commands are as large as what
+    # acted, by least squares.
+    for part in range(3):
+        both = given[:, part] @ acted[:, part] / (given[:, part] @ given[:, part])
+        given[:, part] *= both
+    rows = (part[:, None] for part in (state, given, next_state))
+    (found,) = check([make_history(*rows, DT)])
+    assert found.laws[0].law.name == name
+    assert found.laws[0].fit.log_bayes_factor > 10.0
+    assert found.laws[0].fit.coefficient > 0.0
+
+
+@pytest.mark.slow
 def test_a_mass_that_grows_while_it_is_pushed_is_a_drift():
     """Commands do a tenth more at the begin than the model says, later less."""
     table = worlds.box_table(np.random.default_rng(12), 100)
@@ -285,6 +315,43 @@ def test_reports_say_the_law_in_words_and_numbers():
     # Not looked at: nothing to say.
     bare = result._replace(residual=None)
     assert report_residuals(spec, [bare]) == ([], [], [])
+
+
+@pytest.mark.parametrize(
+    ("size", "by_chance", "is_reason", "is_note"),
+    [
+        (0.5, 1e-12, True, False),
+        (0.5, 1e-5, False, True),
+        (0.1, 1e-12, False, True),
+        (-0.5, 1e-12, False, True),
+        (0.5, 0.1, False, False),
+    ],
+)
+def test_what_goes_on_from_reading_to_reading_is_a_doubt(
+    size: float, by_chance: float, is_reason: bool, is_note: bool
+):
+    """Where it is both large and sure; a little of it is a note."""
+    spec = known_boxes()
+    history = worlds.record_box(np.random.default_rng(16), 20)
+    white = {"position": 0.5, "angle": by_chance}
+    found = ResidualCheck(20, [], [white], (), ({"position": 0.9, "angle": size},))
+    result = BlockResult(make_block(spec, (0,), history), None, 0, found)
+    (entry,), reasons, notes = report_residuals(spec, [result])
+    assert entry["correlation"] == {"box0": {"position": 0.9, "angle": size}}
+    said = [line for line in reasons if "angle readings goes on from one to" in line]
+    assert len(said) == len(reasons) == is_reason
+    assert len(notes) == is_note
+
+
+def test_checks_tell_how_readings_hang_together():
+    """Of a free box next to nothing; of one that is pulled on unseen, much."""
+    rng = np.random.default_rng(17)
+    quiet, pulled = check(
+        [worlds.record_box(rng, 100), worlds.record_box(rng, 100, worlds.viscous(9.0))],
+        impulse=np.array([1e-4, 1e-4]),
+    )
+    assert max(quiet.correlation[0].values()) < 0.4
+    assert pulled.correlation[0]["velocity"] > 0.5
 
 
 COUNTS = {"num_samples": 100, "num_warmup": 50}

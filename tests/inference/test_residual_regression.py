@@ -163,7 +163,7 @@ def test_laws_of_the_bodys_own_frame_turn_with_the_world():
         path.progress,
     )
     for law in LAWS:
-        if law.name in ("constant_force", "heading"):
+        if law.name in ("constant_force", "heading", "axis_limit"):
             continue
         for first, second in zip(law.wrench(path), law.wrench(turned), strict=True):
             np.testing.assert_allclose(first @ turn.T, second, atol=1e-12)

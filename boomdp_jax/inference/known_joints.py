@@ -1,0 +1,86 @@
+"""Joints that a scene knows, held against where readings have the bodies."""
+
+import numpy as np
+from jaxtyping import Float
+
+from boomdp_jax.core.history import History
+from boomdp_jax.inference.reading_sequence import readings_in_order, scatter
+from boomdp_jax.physics.constraint_spec import JOINTS, ConstraintSpec
+from boomdp_jax.physics.params import WORLD
+from boomdp_jax.physics.scene_spec import SceneSpec
+from boomdp_jax.physics.start_gaps import START_TOLERANCE
+
+# Gaps in most readings that are so many times as large as their noise, and as a
+# rounded number of a file makes them, are no noise.
+_TIMES, _LEAST = 4.0, 3.0 * START_TOLERANCE
+_WORDS = {"revolute": "pin", "distance": "rod", "prismatic": "guide", "weld": "weld"}
+
+
+def known_joint_reasons(spec: SceneSpec, history: History) -> list[str]:
+    """Reasons for doubt about known joints that readings are off.
+
+    Args:
+        spec: the scene.
+        history: its readings.
+
+    Returns:
+        One line for each known joint that does not hold, by the median over readings.
+    """
+    readings = readings_in_order(spec, history)
+    reasons = []
+    for joint in spec.constraints:
+        if joint.kind not in JOINTS:
+            continue
+        for gap, unit in _gaps(joint, readings.values):
+            is_read = np.all(np.isfinite(gap), axis=1)
+            noise = scatter(gap, readings.run)
+            if not np.any(is_read) or noise is None:
+                continue
+            size = float(np.median(np.linalg.norm(gap[is_read], axis=1)))
+            if size > max(_TIMES * noise, _LEAST):
+                other = joint.body_b
+                partner = "the world" if other == WORLD else f"{spec.names[other]!r}"
+                reasons.append(
+                    f"{spec.names[joint.body_a]}: its readings are {size:.2g} {unit} "
+                    f"off its known {_WORDS[joint.kind]} to {partner}, with noise of "
+                    f"{noise:.2g} {unit} at most; expected anchors, angles and lengths "
+                    "as the recording has them"
+                )
+    return reasons
+
+
+def _gaps(
+    joint: ConstraintSpec, values: Float[np.ndarray, "reading body 6"]
+) -> list[tuple[Float[np.ndarray, "reading part"], str]]:
+    """By how much a joint fails to hold at each reading, and units.
+
+    NaN where the bodies were not read, or a number of the joint is to be inferred.
+    """
+    pose_a = values[:, joint.body_a, :3]
+    is_world = joint.body_b == WORLD
+    pose_b = np.zeros_like(pose_a) if is_world else values[:, joint.body_b, :3]
+    numbers = joint.numbers
+    offset = _placed(pose_a, numbers["anchor_a"]) - _placed(pose_b, numbers["anchor_b"])
+    gaps = []
+    if joint.kind == "distance":
+        length = np.hypot(offset[:, 0], offset[:, 1]) - float(numbers["length"])
+        gaps.append((length[:, None], "m"))
+    elif joint.kind == "prismatic":
+        angle = pose_b[:, 2] + float(numbers["axis"])
+        across = np.cos(angle) * offset[:, 1] - np.sin(angle) * offset[:, 0]
+        gaps.append((across[:, None], "m"))
+    else:
+        gaps.append((offset, "m"))
+    if joint.kind in ("prismatic", "weld"):
+        turned = pose_a[:, 2] - pose_b[:, 2] - float(numbers["angle"])
+        gaps.append((np.angle(np.exp(1j * turned))[:, None], "rad"))
+    return gaps
+
+
+def _placed(
+    pose: Float[np.ndarray, "reading 3"], anchor: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, "reading 2"]:
+    """Where an anchor is in the world."""
+    cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    x, y = np.asarray(anchor, float)
+    return pose[:, :2] + np.column_stack([cos * x - sin * y, sin * x + cos * y])
