@@ -14,11 +14,14 @@ from boomdp_jax.cli.output import (
 )
 
 
-def run(arguments: argparse.Namespace) -> None:
+def run(arguments: argparse.Namespace) -> list[str]:
     """Infer from each data file and report: in one compiled call, or as a sweep.
 
     Args:
         arguments: what `cli.main` parsed.
+
+    Returns:
+        A line for each data file of a sweep that inference refused.
 
     Raises:
         ValueError: bad input; nothing has been written then.
@@ -32,8 +35,7 @@ def run(arguments: argparse.Namespace) -> None:
     spec = load_scene(arguments.scene)
     print_notes(spec.notes)
     if is_sweep:
-        _sweep(arguments, spec)
-        return
+        return _sweep(arguments, spec)
     histories = _load_histories(arguments, spec)
     posteriors = _infer(arguments, spec, histories)
     for index, posterior in enumerate(posteriors):
@@ -44,6 +46,7 @@ def run(arguments: argparse.Namespace) -> None:
                 posterior.plot(numbered(arguments.plot, index, len(posteriors)))
     for path, posterior in zip(arguments.data, posteriors, strict=True):
         _print(arguments, path, posterior)
+    return []
 
 
 def _print(arguments: argparse.Namespace, path: str, posterior) -> None:
@@ -70,19 +73,18 @@ def _is_sweep(arguments: argparse.Namespace) -> bool:
     return is_folder
 
 
-def _sweep(arguments: argparse.Namespace, spec) -> None:
-    """Infer unit after unit, each written and reported as it is done."""
+def _sweep(arguments: argparse.Namespace, spec) -> list[str]:
+    """Infer unit after unit, each written and reported as it is done.
+
+    Returns:
+        A line for each data file that inference refused.
+    """
     import jax
 
     from boomdp_jax.inference.posterior import load_posterior
     from boomdp_jax.inference.sweep import begin_sweep
 
     shard, batch = arguments.shard or (0, 1), arguments.batch or 16
-    num_units = -(-len(arguments.data) // batch)
-    for unit in range(shard[0], num_units, shard[1]):
-        # Bad input is found before the work begins.
-        for path in arguments.data[unit * batch : (unit + 1) * batch]:
-            _load_table(arguments, spec, path)
     sweep = begin_sweep(
         jax.random.key(arguments.seed),
         spec,
@@ -91,22 +93,31 @@ def _sweep(arguments: argparse.Namespace, spec) -> None:
         shard=shard,
         batch=batch,
         num_rows=arguments.rows,
+        needs_rows=True,
         **_options(arguments),
     )
     units = sweep.units(shard)
     if not arguments.resume:
         sweep.check_untouched(units)
+    # Other recordings than the folder's are refused before the work, too.
+    waiting = {unit for unit in units if not sweep.is_done(unit)}
+    failed: list[str] = []
     for place, unit in enumerate(units):
         print(f"unit {unit}, {place + 1} of {len(units)}", file=sys.stderr)
-        with contextlib.redirect_stdout(sys.stderr):
-            sweep.run(unit, progress=True)
-        for index, path in zip(sweep.objects(unit), sweep.paths(unit), strict=True):
+        if unit in waiting:
+            with contextlib.redirect_stdout(sys.stderr):
+                sweep.run(unit, progress=True)
+        refused = sweep.failed(unit)
+        failed += refused.values()
+        inferred = [index for index in sweep.objects(unit) if index not in refused]
+        for index, path in zip(inferred, sweep.paths(unit), strict=True):
             posterior = load_posterior(path)
             if arguments.plot:
                 with contextlib.redirect_stdout(sys.stderr):
                     num_files = len(arguments.data)
                     posterior.plot(numbered(arguments.plot, index, num_files))
             _print(arguments, arguments.data[index], posterior)
+    return failed
 
 
 def _load_table(arguments: argparse.Namespace, spec, path: str):
@@ -132,13 +143,22 @@ def _infer(arguments: argparse.Namespace, spec, histories: list) -> list:
         import jax
 
         from boomdp_jax.inference.infer import infer, infer_batch
+        from boomdp_jax.inference.members import MemberError
 
         key = jax.random.key(arguments.seed)
         options = _options(arguments)
         if len(histories) == 1:
             return [infer(key, spec, histories[0], progress=True, **options)]
         specs = [spec] * len(histories)
-        return list(infer_batch(key, specs, histories, progress=True, **options))
+        try:
+            return list(infer_batch(key, specs, histories, progress=True, **options))
+        except MemberError as error:
+            first, *others = error.messages
+            text = f"{arguments.data[first]}: {error.messages[first]}"
+            rest = [arguments.data[index] for index in others]
+            if rest:
+                text = f"{text}; refused as well: {', '.join(rest)}"
+            raise ValueError(text) from error
 
 
 def _options(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -78,7 +78,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: arguments after the program's name; default: those of the process.
 
     Returns:
-        Exit status: 0, or 2 for bad input, then with one line on standard error.
+        Exit status: 0; 2 for bad input, then with one line on standard error; or 1
+        where all was done but what inference refused, with a line for each.
     """
     try:
         arguments = _make_parser().parse_args(argv)
@@ -93,7 +94,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         warnings.simplefilter("default")
         warnings.showwarning = _show_warning  # ty: ignore[invalid-assignment]
         try:
-            command.run(arguments)
+            failed = command.run(arguments) or []
         except IsADirectoryError as error:
             folder = error.filename
             _complain(
@@ -108,7 +109,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         except ValueError as error:
             _complain(str(error))
             return 2
-    return 0
+    for line in failed:
+        _complain(line)
+    return 1 if failed else 0
 
 
 class _OneLineParser(argparse.ArgumentParser):
@@ -205,7 +208,8 @@ def _add_infer(parser: argparse.ArgumentParser) -> None:
     add(
         "--resume",
         action="store_true",
-        help="of a sweep: go on where the folder stands, to the same bits",
+        help="of a sweep: go on where the folder stands, to the same bits; what"
+        " inference refused is not tried again",
     )
     add("--json", action="store_true", help="one JSON object a data file, a line each")
     add("--plot", metavar="FIG.png", help="draw the posterior; numbered like --out")

@@ -36,6 +36,7 @@ from boomdp_jax.inference.structure_kernel import StructureKernel as StructureKe
 from boomdp_jax.inference.sweep import Sweep as Sweep
 from boomdp_jax.inference.sweep import begin_sweep as begin_sweep
 from boomdp_jax.inference.sweep import infer_sweep as infer_sweep
+from boomdp_jax.inference.sweep_failures import SweepError as SweepError
 from boomdp_jax.inference.target import StructureTarget as StructureTarget
 
 __all__ = [
@@ -57,6 +58,7 @@ __all__ = [
     "StructureKernel",
     "StructureTarget",
     "Sweep",
+    "SweepError",
     "begin_sweep",
     "identifiability",
     "infer",

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from boomdp_jax.core.history import History
+from boomdp_jax.inference.members import naming
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 
@@ -34,9 +35,10 @@ def check_arguments(key: Any, specs: Any, histories: Any, mesh: Any) -> None:
         raise ValueError(
             f"histories: expected one per scene, {len(specs)}, got {len(histories)}"
         )
-    for spec, history in zip(specs, histories, strict=True):
-        check_spec(spec)
-        check_history(spec, history)
+    for index, (spec, history) in enumerate(zip(specs, histories, strict=True)):
+        with naming(index, len(specs)):
+            check_spec(spec)
+            check_history(spec, history)
 
 
 def check_key(key: Any) -> None:

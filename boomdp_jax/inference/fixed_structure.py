@@ -13,6 +13,7 @@ from boomdp_jax.core.history import History
 from boomdp_jax.inference.block import Block, make_block
 from boomdp_jax.inference.components import independent_blocks
 from boomdp_jax.inference.layout import Layout, SlotKey, block_layout
+from boomdp_jax.inference.members import naming
 from boomdp_jax.inference.redundancy import NEW_KINDS, Tie, is_redundant
 from boomdp_jax.inference.slot_shapes import JOINT_SHAPES
 from boomdp_jax.inference.touching import find_touching
@@ -125,8 +126,18 @@ def check_structure(
         return
     if method not in ("nuts", "svi"):
         raise ValueError(f"structure: expected none with method {method!r}")
-    for spec in {id(spec): spec for spec in specs}.values():
-        fix_structure(spec, structure)
+    different = different_scenes(specs)
+    for index, spec in different.items():
+        with naming(index, len(different)):
+            fix_structure(spec, structure)
+
+
+def different_scenes(specs: Sequence[SceneSpec]) -> dict[int, SceneSpec]:
+    """Scenes that are not the same object as an earlier one, by their numbers."""
+    first: dict[int, int] = {}
+    for index, spec in enumerate(specs):
+        first.setdefault(id(spec), index)
+    return {index: specs[index] for index in first.values()}
 
 
 def structure_blocks(

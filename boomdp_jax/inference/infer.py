@@ -1,7 +1,6 @@
 """From scenes and histories to posteriors: the one call that most users need."""
 
 import dataclasses
-import itertools
 import time
 from collections.abc import Sequence
 
@@ -16,23 +15,23 @@ from boomdp_jax.core.history import History
 from boomdp_jax.core.spread import spread_over
 from boomdp_jax.inference.arguments import check_arguments
 from boomdp_jax.inference.assemble import assemble_posterior
-from boomdp_jax.inference.block import Block, make_block, stack_blocks
-from boomdp_jax.inference.compile_ahead import signature
-from boomdp_jax.inference.components import independent_blocks
+from boomdp_jax.inference.batch_blocks import blocks_of_batch
+from boomdp_jax.inference.block import stack_blocks
 from boomdp_jax.inference.doubts import with_doubts, with_notes
 from boomdp_jax.inference.evidence_report import BlockResult
 from boomdp_jax.inference.fixed_structure import Structure, check_structure
 from boomdp_jax.inference.likelihoods import ChosenLikelihood, choose_likelihood
+from boomdp_jax.inference.members import Refusals
 from boomdp_jax.inference.nuts import run_nuts
-from boomdp_jax.inference.outliers import outlier_notes, without_isolated
+from boomdp_jax.inference.one_structure import check_numbers
+from boomdp_jax.inference.outliers import outlier_notes
 from boomdp_jax.inference.posterior import Posterior, with_diagnostics
+from boomdp_jax.inference.progress_bar import ProgressBar
 from boomdp_jax.inference.residual import check_residuals
 from boomdp_jax.inference.robust_update import DEGREES_OF_FREEDOM
 from boomdp_jax.inference.sample import sample_blocks
-from boomdp_jax.inference.still import bodies_let_be, let_be_note
 from boomdp_jax.inference.structure_draws import SampleSettings
 from boomdp_jax.inference.svi import run_svi
-from boomdp_jax.inference.touching import find_touching
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 METHODS = ("auto", "rj", "enumerate", "smc", "nuts", "svi", "laplace", "map")
@@ -170,7 +169,8 @@ def infer_batch(
         One posterior per scene.
 
     Raises:
-        ValueError: as in `infer`; or not as many histories as scenes.
+        ValueError: as in `infer`, naming the scene by its number where there are
+            several, before any of them is inferred; or not as many histories as scenes.
     """
     settings, chosen = checked_options(
         method=method,
@@ -192,15 +192,20 @@ def infer_batch(
             if method == "nuts":
                 counts["num_warmup"] = settings.num_warmup
             run = {"nuts": run_nuts, "svi": run_svi}[method]
-            missing = [
-                [
-                    note
-                    for body in range(spec.num_bodies)
-                    if not spec.is_static[body]
-                    for note in chosen.notes_on_rows(spec, (body,), history)
-                ]
-                for spec, history in zip(specs, histories, strict=True)
-            ]
+            missing: list[list[str]] = []
+            # Each takes its time: what is wrong with any of them is said before.
+            refusals = Refusals(len(specs))
+            for index, (spec, history) in enumerate(zip(specs, histories, strict=True)):
+                with refusals.of(index):
+                    own = [
+                        note
+                        for body in range(spec.num_bodies)
+                        if not spec.is_static[body]
+                        for note in chosen.notes_on_rows(spec, (body,), history)
+                    ]
+                    check_numbers(spec, history, structure)
+                    missing.append(own)
+            refusals.check()
             posteriors = []
             for index, (spec, history) in enumerate(zip(specs, histories, strict=True)):
                 found = run(
@@ -261,6 +266,8 @@ def checked_options(
         whole_number("num_warmup", num_warmup, 0),
         whole_number("num_samples", num_samples, 1),
     )
+    if method == "nuts" and not counts.num_warmup:
+        raise ValueError("num_warmup: expected at least 1, got 0")
     if outliers not in OUTLIERS:
         raise ValueError(
             f"outliers: expected one of {', '.join(OUTLIERS)}; got {outliers!r}"
@@ -286,30 +293,11 @@ def _infer_structures(
     """Posteriors over structures, equal blocks of all scenes together."""
     start = time.perf_counter()
     histories = padded_histories(histories)
-    problems, notes = [], []
-    for index, (spec, history) in enumerate(zip(specs, histories, strict=True)):
-        trusted = history if freedom is None else without_isolated(history)
-        touching = find_touching(spec, trusted)
-        blocks, screened = independent_blocks(spec, trusted, touching)
-        missing = [likelihood.notes_on_rows(spec, b, history) for b in blocks]
-        let_be = {(body,) for body in bodies_let_be(spec, trusted, touching)}
-        let_be &= set(blocks)
-        left_out = [let_be_note(spec, body) for (body,) in sorted(let_be)]
-        notes.append([*screened, *left_out, *itertools.chain(*missing)])
-        for bodies in blocks:
-            block = make_block(
-                spec,
-                bodies,
-                history,
-                touching=touching,
-                freedom=freedom,
-                is_told=bodies not in let_be,
-            )
-            problems.append((index, block))
+    batch = blocks_of_batch(specs, histories, likelihood, freedom)
     results: dict[int, list[BlockResult]] = {i: [] for i in range(len(specs))}
-    groups = _group(problems)
-    with CompileClock() as clock, _Bar(progress, len(problems)) as bar:
-        for number, members in enumerate(groups):
+    bar = ProgressBar(progress, batch.num_blocks)
+    with CompileClock() as clock, bar:
+        for number, members in enumerate(batch.groups):
             group_key = jax.random.fold_in(key, number)
             stacked = stack_blocks([block for _, block in members])
             draws = sample_blocks(
@@ -330,11 +318,11 @@ def _infer_structures(
     seconds = {"compile": clock.seconds, "run": max(wall - clock.seconds, 0.0)}
     return [
         assemble_posterior(
-            jax.random.fold_in(key, len(groups) + index),
+            jax.random.fold_in(key, len(batch.groups) + index),
             spec,
             results[index],
             seconds=dict(seconds),
-            notes=notes[index],
+            notes=batch.notes[index],
             method=method,
         )
         for index, spec in enumerate(specs)
@@ -358,39 +346,3 @@ def padded_histories(histories: Sequence[History]) -> list[History]:
             capacity = -(-capacity // 4)
         out.append(history.padded(capacity))
     return out
-
-
-def _group(problems: list[tuple[int, Block]]) -> list[list[tuple[int, Block]]]:
-    """Blocks whose targets have the same static parts and array shapes."""
-    groups: dict[object, list[tuple[int, Block]]] = {}
-    for problem in problems:
-        groups.setdefault(signature(problem[1].target), []).append(problem)
-    return list(groups.values())
-
-
-class _Bar:
-    """Progress on standard error; nothing unless asked for."""
-
-    def __init__(self, is_shown: bool, num_blocks: int):
-        self._bar = None
-        if is_shown:
-            from tqdm import tqdm
-
-            self._bar = tqdm(total=num_blocks, unit="block", desc="infer")
-
-    def stage(self, name: str) -> None:
-        """Say what is being done."""
-        if self._bar is not None:
-            self._bar.set_postfix_str(name)
-
-    def advance(self, num: int) -> None:
-        """So many blocks are done."""
-        if self._bar is not None:
-            self._bar.update(num)
-
-    def __enter__(self) -> "_Bar":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.close()

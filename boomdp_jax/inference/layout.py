@@ -245,23 +245,9 @@ def structures(
         ValueError: more structures than can be told apart one by one, or of more
             constraints than compile in reasonable time.
     """
-    groups: dict[tuple, list[int]] = {}
-    for i, slot in enumerate(layout.slots):
-        groups.setdefault((slot.kind, slot.body_a, slot.body_b), []).append(i)
+    check_size(layout, source)
+    groups = _exchangeable(layout)
     sizes = [len(group) + 1 for group in groups.values()]
-    where = f"{source}: unknown" if source else "unknown"
-    if math.prod(sizes) > _MAX_STRUCTURES:
-        raise ValueError(
-            f"{where}: {math.prod(sizes)} structures of a block of "
-            f"{layout.num_bodies} bodies; expected at most {_MAX_STRUCTURES}; lower "
-            "the caps in 'unknown'"
-        )
-    if len(layout.slots) > _MAX_SLOTS:
-        raise ValueError(
-            f"{where}: {len(layout.slots)} constraints of a block of "
-            f"{layout.num_bodies} bodies; expected at most {_MAX_SLOTS}; lower the "
-            "caps in 'unknown'"
-        )
     needs_load = [slot.kind in ("wheel", "ground") for slot in layout.slots]
     needs_load = np.array(needs_load, bool)
     known = [Tie(s.kind, s.body_a, s.body_b, False) for s in layout.known_slots]
@@ -287,6 +273,40 @@ def structures(
             weights.append(weight if is_possible else -math.inf)
     log_prior = np.array(weights)
     return np.stack(rows), log_prior - np.logaddexp.reduce(log_prior)
+
+
+def check_size(layout: Layout, source: str = "") -> None:
+    """Raise unless a block's structures are few enough.
+
+    Args:
+        layout: slots of the block.
+        source: file of the scene, for messages.
+
+    Raises:
+        ValueError: as in `structures`.
+    """
+    sizes = [len(group) + 1 for group in _exchangeable(layout).values()]
+    where = f"{source}: unknown" if source else "unknown"
+    if math.prod(sizes) > _MAX_STRUCTURES:
+        raise ValueError(
+            f"{where}: {math.prod(sizes)} structures of a block of "
+            f"{layout.num_bodies} bodies; expected at most {_MAX_STRUCTURES}; lower "
+            "the caps in 'unknown'"
+        )
+    if len(layout.slots) > _MAX_SLOTS:
+        raise ValueError(
+            f"{where}: {len(layout.slots)} constraints of a block of "
+            f"{layout.num_bodies} bodies; expected at most {_MAX_SLOTS}; lower the "
+            "caps in 'unknown'"
+        )
+
+
+def _exchangeable(layout: Layout) -> dict[tuple, list[int]]:
+    """Slots by kind and bodies: those of one entry could be exchanged."""
+    groups: dict[tuple, list[int]] = {}
+    for i, slot in enumerate(layout.slots):
+        groups.setdefault((slot.kind, slot.body_a, slot.body_b), []).append(i)
+    return groups
 
 
 def _ties(layout: Layout, row: np.ndarray) -> list[Tie]:

@@ -22,6 +22,7 @@ Where few lineages are left, their draws are moved on until they are worth enoug
 independent ones (`lineages`).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -47,6 +48,7 @@ _ENOUGH, _ENOUGH_SHARE, _MOST_MOVES = 100.0, 0.05, 24
 _TOO_FEW, _TOO_FEW_SHARE = 30.0, 0.015
 # Distinct draws that are left of all, below which a result is doubted.
 _LEAST_LEFT = 0.02
+_STAGE = "inferring the noise"
 
 
 class Corrected(NamedTuple):
@@ -71,6 +73,7 @@ def infer_noise(
     z: np.ndarray,
     log_density: np.ndarray,
     evidence: StructureEvidence,
+    report: Callable[[str], None] = lambda stage: None,
 ) -> Corrected:
     """Take draws under fixed gains to draws with the noise inferred.
 
@@ -82,6 +85,7 @@ def infer_noise(
         z: coordinates of each.
         log_density: of each, under the targets.
         evidence: of every structure, under the targets.
+        report: called with how far it is before each resampling and each move.
 
     Returns:
         As many draws, in chains that never exchange any.
@@ -98,6 +102,7 @@ def infer_noise(
     kinds = MoveKinds(problem.num_groups)
     while steps == 0 or (np.any(power < 1.0) and steps < _MAX_STEPS):
         is_under_way = power < 1.0
+        report(f"{_STAGE}, step {steps + 1}, power {power.min():.2g}")
         if steps == 0:
             known = problem, draws, index, num_chains
             found, size, problem = first_step(rng, *known)
@@ -112,9 +117,13 @@ def infer_noise(
         num_moves = np.where((power >= 1.0) & ~is_easy, _LAST_MOVES, _MOVES_BETWEEN)
         num_moves = np.where(is_under_way, num_moves, 0)
         for number in range(num_moves.max()):
+            report(
+                f"{_STAGE}, step {steps}, power {power.min():.2g}, "
+                f"move {number + 1} of {num_moves.max()}"
+            )
             rows = np.flatnonzero((number < num_moves)[index])
             draws = _moved(rng, problem, draws, rows, power, kinds)
-    draws, worth = _spread(rng, problem, draws, index, power, kinds)
+    draws, worth = _spread(rng, problem, draws, index, power, kinds, report)
     shape = structure.shape
     changed = reweighed(
         evidence,
@@ -204,6 +213,7 @@ def _spread(
     index: np.ndarray,
     power: np.ndarray,
     kinds: MoveKinds,
+    report: Callable[[str], None],
 ) -> tuple[NoiseDraws, np.ndarray]:
     """Move on the draws of objects that are worth too few independent ones.
 
@@ -214,6 +224,7 @@ def _spread(
         index: object of each draw.
         power: of each object.
         kinds: of moves.
+        report: called with how far it is before each move.
 
     Returns:
         The draws, and what those of each object are worth.
@@ -232,6 +243,7 @@ def _spread(
         asked = np.flatnonzero(worth < enough)
         if not asked.size or number == _MOST_MOVES:
             break
+        report(f"{_STAGE}, move {number + 1} of at most {_MOST_MOVES}")
         rows = np.flatnonzero(np.isin(index, asked))
         draws = _moved(rng, problem, draws, rows, power, kinds)
     return draws, worth

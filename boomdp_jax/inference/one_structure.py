@@ -122,6 +122,24 @@ def infer_numbers(
     return with_diagnostics(posterior, doubts, extras)
 
 
+def check_numbers(
+    spec: SceneSpec,
+    history: History,
+    structure: Structure | Bool[np.ndarray, " slot"] | None = None,
+) -> None:
+    """Raise as `infer_numbers` would, before anything is fitted.
+
+    Raises:
+        ValueError: a scene or structure of which numbers cannot be inferred.
+    """
+    if structure is not None or not scene_layout(spec).slots:
+        structure_blocks(spec, history, structure)
+        return
+    touching = find_touching(spec, history)
+    for bodies in independent_blocks(spec, history, touching)[0]:
+        make_block(spec, bodies, history, touching=touching)
+
+
 def _most_probable(
     key: Key, spec: SceneSpec, history: History, method: str
 ) -> tuple[dict[str, list], list[str], list[str]]:

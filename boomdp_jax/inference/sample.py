@@ -134,6 +134,7 @@ def sample_blocks(
         drawn.z,
         drawn.log_density,
         drawn.evidence,
+        report,
     )
     shape = (corrected.structure.shape[0], corrected.structure[0].size)
     return BlockDraws(

@@ -7,11 +7,12 @@ Shards of a sweep, on several machines or after a kill, write into the same fold
 - `sweep.json`, what the folder was begun with; others are refused.
 - `object-000012.npz`, the posterior of each object, as `Posterior.save` writes it.
 - `unit-000003.json`, written when all files of a unit are there, with the hashes of
-  what went into them and of themselves: what does not match is done again.
+  what went into them and of themselves: what does not match is done again. Objects
+  that inference refuses have no file: `failed` says why, by number of the object. They
+  count as done, whoever resumes, since the others were inferred without them.
 """
 
 import dataclasses
-import hashlib
 import json
 import os
 from collections.abc import Sequence
@@ -23,29 +24,36 @@ import numpy as np
 
 from boomdp_jax.core.arrays import Key, on_device
 from boomdp_jax.core.checked_input import whole_number
-from boomdp_jax.core.history import History
-from boomdp_jax.core.history_file import load_history
 from boomdp_jax.core.json_file import check_same, read_json, write_json
 from boomdp_jax.core.versions import library_versions
 from boomdp_jax.inference.arguments import check_key
-from boomdp_jax.inference.fixed_structure import Structure, check_structure
+from boomdp_jax.inference.fixed_structure import Structure
 from boomdp_jax.inference.infer import checked_options, infer_batch, seed_of
 from boomdp_jax.inference.sweep_arguments import (
     Recording,
-    check_files,
+    check_recordings,
+    check_scenes,
     checked_num_rows,
     checked_shard,
     listed,
     structure_for_file,
 )
+from boomdp_jax.inference.sweep_failures import all_but_refused, all_done
+from boomdp_jax.inference.sweep_inputs import (
+    hash_of,
+    hash_of_scenes,
+    input_hash,
+    named,
+    other_input,
+    read_recording,
+    with_room,
+)
+from boomdp_jax.inference.sweep_record import UnitRecord
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 SCHEMA = "boomdp-sweep-1"
-UNIT_SCHEMA = "boomdp-sweep-unit-1"
 
 _MANIFEST = "sweep.json"
-# Fewest rows that a history is padded to.
-_LEAST_ROWS = 4
 
 
 def infer_sweep(
@@ -66,11 +74,16 @@ def infer_sweep(
     What is there already is not done again. A run that was killed at any moment, and
     shards of other processes, end in the same arrays as one run of everything.
 
+    Scenes and files of this shard are looked at before anything is inferred. What only
+    inference finds wrong with an object is recorded in the folder: all others are
+    done, then it is raised. It is not tried again when the sweep is resumed, which
+    raises the same.
+
     Args:
         key: random key; the key of a unit is folded in from its number.
         specs: one scene for all, or one for each history.
         histories: recordings, or files of the form `planar-transitions-1`, which are
-            read when their unit's turn comes; a single one is a list of one.
+            read again when their unit's turn comes; a single one is a list of one.
         out_dir: folder to write to; made if its parent is there.
         shard: (i, n): do units i, i + n, i + 2 n and so on.
         batch: objects of one unit, inferred in one compiled call.
@@ -87,7 +100,11 @@ def infer_sweep(
     Raises:
         TypeError: a key, scenes or recordings that are none.
         ValueError: a folder that was begun with something else, a shard that does not
-            exist, or as in `infer_batch`.
+            exist, files that do not fit their scenes, all of them named, or options as
+            in `infer_batch`.
+        SweepError: when all else is done: objects that inference refused. It is a
+            ValueError with a line for each, `failed`, and the files of all others,
+            `paths`.
         OSError: a file cannot be read or written.
     """
     sweep = begin_sweep(
@@ -103,9 +120,10 @@ def infer_sweep(
     units = sweep.units(shard)
     if not resume:
         sweep.check_untouched(units)
-    for unit in units:
+    # Other recordings than the folder's are refused before the work, too.
+    for unit in [unit for unit in units if not sweep.is_done(unit)]:
         sweep.run(unit, progress=progress)
-    return [path for unit in units for path in sweep.paths(unit)]
+    return sweep.finish(units)
 
 
 def begin_sweep(
@@ -125,6 +143,7 @@ def begin_sweep(
     num_chains: int = 4,
     num_warmup: int = 200,
     num_samples: int = 500,
+    needs_rows: bool = False,
 ) -> "Sweep":
     """Make or reopen the folder of a sweep, whose units can then be run one by one.
 
@@ -147,6 +166,8 @@ def begin_sweep(
         num_chains: as in `infer_batch`.
         num_warmup: as in `infer_batch`.
         num_samples: as in `infer_batch`.
+        needs_rows: whether files without rows, whose posterior is the prior, are
+            refused.
 
     Returns:
         The sweep; nothing of it has been run yet.
@@ -154,8 +175,8 @@ def begin_sweep(
     Raises:
         TypeError: a key, scenes or recordings that are none.
         ValueError: a folder that was begun with something else, or arguments that make
-            no sense.
-        OSError: a recording cannot be opened, or the folder not be made.
+            no sense, or recordings that do not fit their scenes.
+        OSError: a recording cannot be read, or the folder not be made.
     """
     counts, _ = checked_options(
         method=method,
@@ -192,9 +213,14 @@ def begin_sweep(
     path = sweep.folder / _MANIFEST
     if path.exists():
         sweep.check_folder()
-    check_structure(specs, method, structure)
-    for unit in sweep.units(shard):
-        check_files([histories[number] for number in sweep.objects(unit)])
+    check_scenes(specs, method, structure)
+    check_recordings(
+        specs,
+        histories,
+        [number for unit in sweep.units(shard) for number in sweep.objects(unit)],
+        num_rows=sweep.num_rows,
+        needs_rows=needs_rows,
+    )
     sweep.folder.mkdir(exist_ok=True)
     if not path.exists():
         write_json(path, sweep.manifest())
@@ -239,42 +265,42 @@ class Sweep:
         return range(begin, min(begin + self.batch, len(self.histories)))
 
     def paths(self, unit: int) -> list[Path]:
-        """Files of the posteriors of a unit."""
-        return [self.folder / f"object-{n:06d}.npz" for n in self.objects(unit)]
+        """Files of the posteriors of a unit; failed objects have none."""
+        failed = self.failed(unit)
+        return [self._path(n) for n in self.objects(unit) if n not in failed]
 
     def is_done(self, unit: int) -> bool:
-        """Whether a unit's files are there, whole.
+        """Whether a unit's files are there, whole; objects that failed count as done.
 
         Raises:
             ValueError: they are, and were made from other recordings or scenes.
         """
-        path = self._record(unit)
-        if not path.exists():
-            return False
-        try:
-            record = read_json(path, UNIT_SCHEMA)
-        except ValueError:
-            return False
-        files, inputs = record.get("files"), record.get("inputs")
+        record = UnitRecord.read(self._record(unit))
         numbers = self.objects(unit)
-        if not isinstance(files, dict) or not isinstance(inputs, list):
+        paths = {number: self._path(number) for number in numbers}
+        if record is None or not record.is_whole(paths):
             return False
-        if len(inputs) != len(numbers):
-            return False
-        for file in self.paths(unit):
-            known = files.get(file.name)
-            if not file.exists() or known != _hash(file.read_bytes()):
-                return False
-        for number, known in zip(numbers, inputs, strict=True):
+        for number, known in zip(numbers, record.inputs, strict=True):
             if known != self._input_hash(number):
                 source = self.histories[number]
-                name = "" if isinstance(source, History) else f" ({source})"
-                raise ValueError(
-                    f"{path}: inputs: object {number}{name}: expected the recording "
-                    "and scene that the folder was begun with, got others; choose "
-                    "another folder"
-                )
+                raise other_input(self._record(unit), number, source)
         return True
+
+    def failed(self, unit: int) -> dict[int, str]:
+        """Objects of a unit that inference refused: a line for each, by its number."""
+        record = UnitRecord.read(self._record(unit))
+        return {} if record is None else record.failures(self.objects(unit))
+
+    def finish(self, units: Sequence[int]) -> list[Path]:
+        """Files of all objects of units that are done, in order.
+
+        Raises:
+            SweepError: inference refused some of the objects; it has the lines that
+                say why, and the files of the others.
+        """
+        failed = {n: line for unit in units for n, line in self.failed(unit).items()}
+        paths = [path for unit in units for path in self.paths(unit)]
+        return all_done(self.folder, failed, paths)
 
     def check_folder(self) -> None:
         """Make sure that the folder was begun with this sweep, as this process runs it.
@@ -304,6 +330,9 @@ class Sweep:
     def run(self, unit: int, *, progress: bool = False) -> bool:
         """Do a unit, unless it is done.
 
+        An object that inference refuses is recorded, see `failed`, and the others are
+        inferred without it.
+
         Args:
             unit: its number.
             progress: show stages on standard error.
@@ -315,43 +344,45 @@ class Sweep:
             return False
         # Hashed before it is read: a recording that changes meanwhile is noticed.
         inputs = [self._input_hash(number) for number in self.objects(unit)]
-        histories = [self._history(number) for number in self.objects(unit)]
-        capacity = roomy(max(history.capacity for history in histories))
-        longest = int(np.argmax([history.capacity for history in histories]))
-        histories[longest] = histories[longest].padded(capacity)
-        specs = [self.specs[number] for number in self.objects(unit)]
-        posteriors = infer_batch(
-            jax.random.fold_in(self.key, unit),
-            specs,
-            histories,
-            progress=progress,
-            **self.options,
+        histories = {
+            n: read_recording(self.specs[n], self.histories[n], self.num_rows)
+            for n in self.objects(unit)
+        }
+        posteriors, refused = all_but_refused(
+            self.objects(unit),
+            lambda numbers: infer_batch(
+                jax.random.fold_in(self.key, unit),
+                [self.specs[number] for number in numbers],
+                with_room([histories[number] for number in numbers]),
+                progress=progress,
+                **self.options,
+            ),
         )
         files = {}
-        for path, posterior in zip(self.paths(unit), posteriors, strict=True):
+        for number in self.objects(unit):
+            path = self._path(number)
             # Left by a run that was killed as it wrote.
             for partial in self.folder.glob(f".{path.name}.*.part"):
                 partial.unlink(missing_ok=True)
+            if number in refused:
+                path.unlink(missing_ok=True)
+                continue
+            posterior = posteriors[number]
             dataclasses.replace(posterior, seed=seed_of(self.key)).save(path)
-            files[path.name] = _hash(path.read_bytes())
-        write_json(
-            self._record(unit),
-            {"schema": UNIT_SCHEMA, "unit": unit, "inputs": inputs, "files": files},
-        )
+            files[path.name] = hash_of(path.read_bytes())
+        failed = named(refused, self.histories)
+        UnitRecord(inputs, files, failed).write(self._record(unit), unit)
         return True
 
     def manifest(self) -> dict:
         """All that the bits of the results depend on, but for the recordings."""
-        # Mostly one and the same for thousands of recordings.
-        each = {id(spec): spec for spec in self.specs}
-        scenes = {name: _scene_bytes(spec) for name, spec in each.items()}
         return {
             "schema": SCHEMA,
             "seed": seed_of(self.key),
             "num_objects": len(self.histories),
             "batch": self.batch,
             "num_rows": self.num_rows,
-            "scenes": _hash(*(scenes[id(spec)] for spec in self.specs)),
+            "scenes": hash_of_scenes(self.specs),
             **self.options,
             "float": str(jax.dtypes.canonicalize_dtype(float)),
             "platform": jax.default_backend(),
@@ -361,40 +392,8 @@ class Sweep:
     def _record(self, unit: int) -> Path:
         return self.folder / f"unit-{unit:06d}.json"
 
-    def _history(self, number: int) -> History:
-        source = self.histories[number]
-        if isinstance(source, History):
-            return source
-        spec = self.specs[number]
-        return load_history(source, spec=spec, num_rows=self.num_rows)
+    def _path(self, number: int) -> Path:
+        return self.folder / f"object-{number:06d}.npz"
 
     def _input_hash(self, number: int) -> str:
-        """Of a recording and its scene."""
-        source = self.histories[number]
-        scene = _scene_bytes(self.specs[number])
-        if not isinstance(source, History):
-            return _hash(scene, Path(source).read_bytes())
-        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(source)]
-        parts = [(f"{x.dtype}{x.shape}".encode(), x.tobytes()) for x in leaves]
-        return _hash(scene, *(part for pair in parts for part in pair))
-
-
-def roomy(num_rows: int) -> int:
-    """The next of 4, 6, 8, 12, 16, 24...: few lengths, so that few are compiled for."""
-    power = _LEAST_ROWS
-    while 2 * power <= num_rows:
-        power *= 2
-    return next(n for n in (power, power * 3 // 2, 2 * power) if n >= num_rows)
-
-
-def _scene_bytes(spec: SceneSpec) -> bytes:
-    return json.dumps(spec.to_dict(), sort_keys=True).encode()
-
-
-def _hash(*parts: bytes) -> str:
-    """Of several strings of bytes, one after the other, each with its length."""
-    found = hashlib.sha256()
-    for part in parts:
-        found.update(len(part).to_bytes(8, "big"))
-        found.update(part)
-    return found.hexdigest()
+        return input_hash(self.specs[number], self.histories[number])

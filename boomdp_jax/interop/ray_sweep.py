@@ -48,7 +48,8 @@ def sweep_with_ray(
     Raises:
         ImportError: Ray is not installed.
         ValueError: a unit was made from other recordings or scenes; or, from a worker,
-            other versions there than the folder was begun with.
+            other versions there than the folder was begun with. A `SweepError`, once
+            all else is done: inference refused some of the objects.
     """
     try:
         # Looked up by name, since it is an extra.
@@ -64,8 +65,11 @@ def sweep_with_ray(
     is_double = bool(jax.dtypes.canonicalize_dtype(float) == np.float64)
     shared = ray.put(_pack(sweep))
     waiting = {}
-    for unit in sweep.units():
-        if sweep.is_done(unit):
+    units = sweep.units()
+    # Other recordings than the folder's are refused before the work begins.
+    is_done = [sweep.is_done(unit) for unit in units]
+    for unit in units:
+        if is_done[unit]:
             on_done(unit)
         else:
             waiting[task.remote(shared, unit, is_double)] = unit
@@ -74,7 +78,7 @@ def sweep_with_ray(
         # Raises what the task raised.
         ray.get(first)
         on_done(waiting.pop(first))
-    return [path for unit in sweep.units() for path in sweep.paths(unit)]
+    return sweep.finish(units)
 
 
 class _Parcel(NamedTuple):

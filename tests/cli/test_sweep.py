@@ -8,6 +8,7 @@ import pytest
 
 from boomdp_jax.cli.main import main
 from boomdp_jax.inference import sweep as sweeps
+from boomdp_jax.inference.members import Refusals
 from tests.inference.test_sweep import cheap_batch
 
 SCENE = {
@@ -104,3 +105,66 @@ def test_other_settings_are_refused_and_named(
     ):
         assert main([*COMMAND.split(), "--resume", *change.split()]) == 2
         assert message in capsys.readouterr().err
+
+
+def test_what_inference_refuses_is_told_when_all_else_is_done(
+    calls: list, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
+    def refuse(key, specs, histories, **options):
+        refusals = Refusals(len(specs))
+        for place, history in enumerate(histories):
+            # Of the files data0.npz and data3.npz.
+            with refusals.of(place):
+                if int(np.sum(history.mask)) in (4, 7):
+                    raise ValueError("scene: unknown: too many")
+        refusals.check()
+        return cheap_batch(key, specs, histories, **options)
+
+    assert main(COMMAND.replace("out/", "whole/").split()) == 0
+    whole = [report["bodies"] for report in reports(capsys)]
+    monkeypatch.setattr(sweeps, "infer_batch", refuse)
+    for more in ([], ["--resume"]):
+        assert main([*COMMAND.split(), *more]) == 1
+        output = capsys.readouterr()
+        found = [json.loads(line) for line in output.out.splitlines()]
+        assert [report["bodies"] for report in found] == [whole[i] for i in (1, 2, 4)]
+        errors = [line for line in output.err.splitlines() if "error" in line]
+        assert errors == [
+            f"boomdp_jax: error: data{number}.npz: scene: unknown: too many"
+            for number in (0, 3)
+        ]
+        assert output.err.splitlines()[-2:] == errors
+
+
+def test_all_bad_files_are_named_before_the_work(
+    calls: list, capsys: pytest.CaptureFixture
+):
+    none = np.zeros((0, 1, 6))
+    np.savez("data1.npz", state=none, action=none[..., :3], next_state=none, dt=0.02)
+    assert main(COMMAND.split()) == 2
+    error = capsys.readouterr().err
+    assert "error: data1.npz: expected at least one row, got none" in error
+    Path("data4.npz").unlink()
+    assert main(COMMAND.split()) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "got 2 of 5 files that do not: data1.npz: expected at least one row" in line
+    assert line.endswith("; data4.npz: No such file or directory")
+    assert calls == []
+    assert not Path("out").exists()
+
+
+def test_without_a_sweep_the_files_that_are_refused_are_named_too(
+    calls: list, capsys: pytest.CaptureFixture
+):
+    for number in (1, 3):
+        state = np.full((4, 1, 6), np.nan)
+        action = np.zeros((4, 1, 3))
+        np.savez(
+            f"data{number}.npz", state=state, action=action, next_state=state, dt=0.02
+        )
+    command = f"infer {FILES} --scene scene.json --likelihood one-step"
+    assert main(command.split()) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    wrong = "boomdp_jax: error: data1.npz: scene.json: table: likelihood 'one-step'"
+    assert error.startswith(wrong)
+    assert error.endswith("'filtered' does without; refused as well: data3.npz")

@@ -1,5 +1,7 @@
 """Noise inferred with everything else, against sums over the joint normal density."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import multivariate_t
 
+from boomdp_jax.inference import noise_correction
 from boomdp_jax.inference.infer import infer
 from boomdp_jax.inference.noise_level import NoiseFit, log_noise_prior, prior_noise
 from tests.inference.joint_normal import joint_normal
@@ -98,3 +101,28 @@ def test_mass_noise_and_evidence_are_those_of_the_joint_density(reference, metho
     np.testing.assert_allclose(ratio[1:], 1.0, atol=0.35)
     error = posterior.diagnostics["log_evidence_error"]
     assert abs(float(posterior.log_evidence) - evidence) < 0.05 + 4.0 * error
+
+
+@pytest.mark.slow
+def test_progress_is_told_move_by_move_and_changes_nothing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    # Draws are never worth enough, and few moves are made.
+    for name, value in {"_ENOUGH": 1e9, "_ENOUGH_SHARE": 10, "_MOST_MOVES": 3}.items():
+        monkeypatch.setattr(noise_correction, name, value)
+    history = free_box(np.random.default_rng(0), 30)
+    known = jax.random.key(3), box_scene(), history
+    options = {"method": "smc", "num_chains": 2, "num_samples": 64, "num_warmup": 1}
+    told = infer(*known, progress=True, **options)
+    stages = capsys.readouterr().err
+    assert re.search(r"inferring the noise, step 1, power 0\]", stages)
+    assert re.search(r"inferring the noise, step \d+, power 1, move 1 of \d", stages)
+    for number in (1, 2, 3):
+        assert f"inferring the noise, move {number} of at most 3]" in stages
+    silent = infer(*known, **options)
+    assert not capsys.readouterr().err
+    for one, other in zip(
+        jax.tree.leaves(told.params), jax.tree.leaves(silent.params), strict=True
+    ):
+        assert np.asarray(one).tobytes() == np.asarray(other).tobytes()
+    assert float(told.log_evidence) == float(silent.log_evidence)

@@ -20,7 +20,8 @@ from boomdp_jax.core.json_file import read_json
 from boomdp_jax.core.npz_file import read_npz
 from boomdp_jax.inference import sweep as sweeps
 from boomdp_jax.inference.posterior import Posterior, load_posterior
-from boomdp_jax.inference.sweep import begin_sweep, infer_sweep, roomy
+from boomdp_jax.inference.sweep import begin_sweep, infer_sweep
+from boomdp_jax.inference.sweep_inputs import roomy
 from boomdp_jax.physics.scene_spec import scene_spec_from_dict
 from tests.inference.posteriors import table_posterior, table_spec
 from tests.inference.recordings import box_scene, free_box

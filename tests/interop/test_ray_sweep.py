@@ -9,7 +9,9 @@ import jax
 import numpy as np
 import pytest
 
+from boomdp_jax.inference import SweepError
 from boomdp_jax.inference import sweep as sweeps
+from boomdp_jax.inference.members import Refusals
 from boomdp_jax.inference.sweep import Sweep, begin_sweep, infer_sweep
 from boomdp_jax.interop.ray_sweep import sweep_with_ray
 from tests.inference.recordings import box_scene, free_box
@@ -113,6 +115,33 @@ def test_what_a_task_raises_is_raised(
     monkeypatch.setattr(sweeps, "library_versions", lambda: {"jax": "0"})
     with pytest.raises(ValueError, match=r"sweep\.json: versions\."):
         sweep_with_ray(sweep)
+
+
+def test_what_inference_refuses_is_raised_when_all_else_is_done(
+    tmp_path: Path, ray: LocalRay, monkeypatch: pytest.MonkeyPatch
+):
+    def refuse(key, specs, histories, **options):
+        refusals = Refusals(len(specs))
+        for place, history in enumerate(histories):
+            # Of object 2.
+            with refusals.of(place):
+                if int(np.sum(history.mask)) == 7:
+                    raise ValueError("too long")
+        refusals.check()
+        return cheap_batch(key, specs, histories, **options)
+
+    monkeypatch.setattr(sweeps, "infer_batch", refuse)
+    sweep, done = begin(tmp_path), []
+    with pytest.raises(SweepError) as caught:
+        sweep_with_ray(sweep, on_done=done.append)
+    assert done == [2, 1, 0]
+    assert caught.value.failed == {2: "object 2: too long"}
+    assert len(caught.value.paths) == 4
+    # A resume finds the same, and asks nothing of Ray.
+    num_kept = len(ray.store)
+    with pytest.raises(SweepError, match="refused: object 2: too long"):
+        sweep_with_ray(sweep)
+    assert len(ray.store) == num_kept + 1
 
 
 def test_without_ray_the_extra_is_named(
