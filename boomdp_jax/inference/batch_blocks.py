@@ -91,6 +91,7 @@ def _blocks_of_scene(
             touching=touching,
             freedom=freedom,
             is_told=bodies not in let_be,
+            cuts_turns=True,
         )
         for bodies in blocks
     ], notes
