@@ -10,65 +10,20 @@ from scipy import stats
 
 import boomdp_jax
 from boomdp_jax.core.history import History, make_history
-from boomdp_jax.inference.block import make_block, stack_blocks
+from boomdp_jax.inference.block import make_block
 from boomdp_jax.inference.evidence_report import BlockResult
-from boomdp_jax.inference.residual import FEWEST_ROWS, ResidualCheck, check_residuals
+from boomdp_jax.inference.residual import FEWEST_ROWS, ResidualCheck
 from boomdp_jax.inference.residual_laws import LAWS
 from boomdp_jax.inference.residual_report import describe_law, report_residuals
-from boomdp_jax.inference.sample import BlockDraws
 from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
 from tests.inference import residual_worlds as worlds
-from tests.inference.recordings import AREA, DT, MASS, SIZE, box_scene, free_box
-
-READING = np.array([1e-3, 1e-3, 5e-3, 5e-3])
-IMPULSE = np.array([0.05, 0.05])
-"""Of a motion that the model does not know well [m/s, rad/s]."""
-
-
-def known_boxes(num: int = 1) -> SceneSpec:
-    """Boxes of the right mass that do not touch."""
-    body = {
-        "shape": {"type": "box", "half_extents": list(SIZE)},
-        "density": MASS / AREA,
-    }
-    return scene_spec_from_dict(
-        {
-            "schema": "planar-scene-1",
-            "dt": DT,
-            "bodies": [{"name": f"box{i}", **body} for i in range(num)],
-        },
-        source="test",
-    )
-
-
-def check(
-    histories: list[History],
-    spec: SceneSpec | None = None,
-    impulse: np.ndarray = IMPULSE,
-    z: np.ndarray | None = None,
-) -> list[ResidualCheck]:
-    """With the noise of readings known, all bodies in one block.
-
-    Coordinates are given, or zero where there are none that matter.
-    """
-    spec = known_boxes() if spec is None else spec
-    num_bodies = spec.num_bodies
-    blocks = [make_block(spec, tuple(range(num_bodies)), each) for each in histories]
-    targets = stack_blocks(blocks)
-    num = len(histories)
-    z = np.zeros(targets.slot.shape[1]) if z is None else z
-    draws = BlockDraws(
-        structure=np.zeros((num, 2), int),
-        z=np.tile(z, (num, 2, 1)),
-        log_density=np.tile([np.nan, 0.0], (num, 1)),
-        noise_scale=np.tile(READING, (num, 2, num_bodies, 1)),
-        impulse_scale=np.tile(impulse, (num, 2, num_bodies, 1)),
-        log_evidence=np.zeros(num),
-        evidence=None,
-        diagnostics=[],
-        chain_index=np.zeros(1, int),
-    )
-    return check_residuals(targets, draws)
+from tests.inference.recordings import AREA, DT, MASS, box_scene, free_box
+from tests.inference.residual_checks import (
+    IMPULSE,
+    assert_names,
+    check,
+    known_boxes,
+)
 
 
 def scaled(spec: SceneSpec, history: History, name: str, value: float) -> float:
@@ -76,15 +31,6 @@ def scaled(spec: SceneSpec, history: History, name: str, value: float) -> float:
     likelihood: Any = make_block(spec, (0,), history).target.log_likelihood
     scales = likelihood.coordinates.scales
     return (value - float(scales.center[name])) / float(scales.spread[name])
-
-
-def assert_names(found: ResidualCheck, name: str, expected, num_sds: float = 4.0):
-    """The best law is this one, decisively, with these coefficients."""
-    best = found.laws[0]
-    assert best.law.name == name
-    assert best.fit.log_bayes_factor > 10.0
-    error = np.abs(best.fit.coefficient - np.array(expected))
-    assert np.all(error < num_sds * best.fit.sd)
 
 
 WRONG = {
@@ -215,81 +161,6 @@ def test_dry_friction_is_not_viscous():
     error = laws["coulomb"].coefficient + 2.0
     np.testing.assert_array_less(np.abs(error), 4.0 * laws["coulomb"].sd)
     assert laws["viscous"].log_bayes_factor < 0.0
-
-
-@pytest.mark.slow
-def test_commands_that_come_late_are_a_delay():
-    """By 8 ms of steps of 20 ms: part of each wrench is the one before."""
-    table = worlds.box_table(np.random.default_rng(11), 100)
-    state, acted, next_state = table
-    share, given = 0.4, np.zeros_like(acted)
-    # What acted is the mean over the step of what was given then and before.
-    for row in range(len(acted)):
-        past = given[row - 1] if row else np.zeros(3)
-        given[row] = (acted[row] - share * past) / (1.0 - share)
-    history = make_history(state[:, None], given[:, None], next_state[:, None], DT)
-    (found,) = check([history])
-    assert_names(found, "delay", [share * DT])
-
-
-@pytest.mark.slow
-def test_commands_that_are_recorded_late_are_an_advance():
-    """By 8 ms of steps of 20 ms: part of each wrench is the one after, in two runs."""
-    table = worlds.box_table(np.random.default_rng(13), 100)
-    state, acted, next_state = table
-    share, given = 0.4, np.zeros_like(acted)
-    episode = np.arange(100) // 50
-    for row in reversed(range(len(acted))):
-        has_next = row + 1 < len(acted) and episode[row + 1] == episode[row]
-        later = given[row + 1] if has_next else acted[row]
-        given[row] = (acted[row] - share * later) / (1.0 - share)
-    rows = (part[:, None] for part in (state, given, next_state))
-    (found,) = check([make_history(*rows, DT, episode=episode)])
-    assert_names(found, "advance", [share * DT])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["axis_limit", "torque_limit", "force_limit"])
-def test_commands_that_are_cut_off_are_a_limit(name):
-    """At 1.2 of their sd; what a mass would explain is taken into account."""
-    state, acted, next_state = worlds.box_table(np.random.default_rng(14), 100)
-    usual = np.array([20.0, 20.0, 3.0])
-    given = acted.copy()
-    # What acts is within limits already, as the command beyond it does nothing more.
-    rng = np.random.default_rng(15)
-    bold = rng.uniform(1.0, 3.0, size=len(given))
-    if name == "axis_limit":
-        over = np.abs(acted[:, :2]) > 1.2 * usual[:2]
-        given[:, :2] *= np.where(over, bold[:, None], 1.0)
-    elif name == "torque_limit":
-        given[:, 2] *= np.where(np.abs(acted[:, 2]) > 1.2 * usual[2], bold, 1.0)
-    else:
-        over = np.hypot(*acted[:, :2].T) > 1.2 * usual[0]
-        given[:, :2] *= np.where(over, bold, 1.0)[:, None]
-    # The mass is known here, so gains would show first: commands are as large as what
-    # acted, by least squares.
-    for part in range(3):
-        both = given[:, part] @ acted[:, part] / (given[:, part] @ given[:, part])
-        given[:, part] *= both
-    rows = (part[:, None] for part in (state, given, next_state))
-    (found,) = check([make_history(*rows, DT)])
-    assert found.laws[0].law.name == name
-    assert found.laws[0].fit.log_bayes_factor > 10.0
-    assert found.laws[0].fit.coefficient > 0.0
-
-
-@pytest.mark.slow
-def test_a_mass_that_grows_while_it_is_pushed_is_a_drift():
-    """Commands do a tenth more at the begin than the model says, later less."""
-    table = worlds.box_table(np.random.default_rng(12), 100)
-    state, acted, next_state = table
-    progress = (np.arange(100) + 0.5) / 100 - 0.5
-    given = acted / (1.0 - 0.2 * progress)[:, None]
-    rows = (part[:, None] for part in (state, given, next_state))
-    # Room that is not in use is no part of the recording.
-    history = make_history(*rows, DT, capacity=160)
-    (found,) = check([history])
-    assert_names(found, "drift", [-0.2, -0.2])
 
 
 @pytest.mark.slow
