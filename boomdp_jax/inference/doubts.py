@@ -8,16 +8,14 @@ from boomdp_jax.inference.drag_doubts import drag_reasons
 from boomdp_jax.inference.known_joints import known_joint_reasons
 from boomdp_jax.inference.lever_doubts import lever_reasons
 from boomdp_jax.inference.noise_doubts import noise_reasons
-from boomdp_jax.inference.pose_velocity_agreement import (
-    pose_velocity_notes,
-    pose_velocity_reasons,
-)
+from boomdp_jax.inference.pose_velocity_agreement import pose_velocity_notes
 from boomdp_jax.inference.posterior import Posterior, with_diagnostics
 from boomdp_jax.inference.run_breaks import run_break_reasons
 from boomdp_jax.inference.stance_doubts import stance_reasons
 from boomdp_jax.inference.still import still_notes, still_reasons
 from boomdp_jax.inference.unread import unread_notes
 from boomdp_jax.inference.unread_angles import angle_reasons
+from boomdp_jax.inference.velocity_doubts import velocity_reasons
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 
@@ -48,7 +46,7 @@ def with_doubts(
     )
     reasons = [
         *run_break_reasons(spec, history),
-        *pose_velocity_reasons(spec, history),
+        *velocity_reasons(spec, history),
         *angle_sense_reasons(spec, history),
         *known_joint_reasons(spec, history),
         *noise_reasons(spec, history, *noise),

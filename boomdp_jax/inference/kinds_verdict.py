@@ -8,18 +8,17 @@ import numpy as np
 
 from boomdp_jax.core.arrays import on_device
 from boomdp_jax.core.history import History
+from boomdp_jax.inference.angle_sense import angle_sense_reasons
 from boomdp_jax.inference.kind_objects import ObjectsAlone
 from boomdp_jax.inference.kinds_file import LearntKinds
 from boomdp_jax.inference.outliers import outlier_notes
-from boomdp_jax.inference.pose_velocity_agreement import (
-    pose_velocity_notes,
-    pose_velocity_reasons,
-)
+from boomdp_jax.inference.pose_velocity_agreement import pose_velocity_notes
 from boomdp_jax.inference.posterior import Posterior, with_diagnostics
 from boomdp_jax.inference.run_breaks import run_break_reasons
 from boomdp_jax.inference.stance_doubts import stance_reasons
 from boomdp_jax.inference.unread import unread_notes
 from boomdp_jax.inference.unread_angles import angle_reasons
+from boomdp_jax.inference.velocity_doubts import velocity_reasons
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 # Reasons, and notes, that are written out where people read them.
@@ -141,7 +140,8 @@ def with_kind_doubts(
     )
     reasons = [
         *run_break_reasons(spec, used),
-        *pose_velocity_reasons(spec, used),
+        *velocity_reasons(spec, used),
+        *angle_sense_reasons(spec, used),
         *angle_reasons(spec, used, posterior),
         *stance_reasons(spec, posterior),
     ]
