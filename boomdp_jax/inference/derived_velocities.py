@@ -49,7 +49,7 @@ _WINDOWS, _ORDERS = (5, 7, 9, 11, 13, 15, 17, 19, 21), (2, 3, 4)
 # Steps whose lengths differ by no more than this share of themselves are even.
 _EVEN = 1e-3
 # More rows tell no more.
-_MOST_ROWS = 2000
+_MOST_ROWS = 600
 _TWIST = {"positions": "velocities", "angles": "angular velocities"}
 
 
