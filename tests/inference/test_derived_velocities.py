@@ -89,6 +89,10 @@ def unchanged(states):
     return states
 
 
+def _slow(value):
+    return pytest.param(value, marks=pytest.mark.slow)
+
+
 WRITTEN = [unchanged, in_single_precision, in_four_digits]
 
 
@@ -120,7 +124,7 @@ def test_measured_velocities_of_other_motions_pass(written, noise, force, hold):
 
 
 @pytest.mark.parametrize("noise", NOISES)
-@pytest.mark.parametrize("rate", [1.0, 10.0, 60.0])
+@pytest.mark.parametrize("rate", [_slow(1.0), 10.0, _slow(60.0)])
 def test_swings_and_rest_are_not_named(noise, rate):
     for seed in range(4):
         rng = np.random.default_rng(seed)
@@ -146,7 +150,7 @@ def test_constant_speeds_and_one_impact_are_not_named(noise):
 
 
 @pytest.mark.parametrize("way", DERIVED)
-@pytest.mark.parametrize("hold", [1, 5])
+@pytest.mark.parametrize("hold", [_slow(1), 5])
 def test_velocities_computed_from_poses_are_named(way, hold):
     for seed in range(3):
         states = derived(pushed(seed, 80, hold=hold), way)

@@ -83,7 +83,9 @@ def test_steps_of_a_lone_body_are_cut_where_it_may_hang_on_a_rod():
         assert num_parts(spec, turning(9.0, 1)) == expected
 
 
-@pytest.mark.parametrize("rate", [4.5, 9.0, 12.0])
+@pytest.mark.parametrize(
+    "rate", [9.0, *(pytest.param(r, marks=pytest.mark.slow) for r in (4.5, 12.0))]
+)
 def test_a_step_so_cut_goes_where_mujoco_goes(rate: float):
     """Within 0.6 mrad; in one part it is up to 11 mrad off."""
     model = mujoco.MjModel.from_xml_string(DOCUMENT)
