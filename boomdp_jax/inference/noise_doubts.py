@@ -50,7 +50,8 @@ def noise_reasons(
     inferred = np.median(noise_scale, axis=0)
     prior = np.median(prior_noise_scale, axis=0)
     reasons = []
-    step = float(np.median(np.asarray(history.dt, float)[np.asarray(history.mask)]))
+    rows = np.asarray(history.mask)
+    step = float(np.median(np.asarray(history.dt)[rows])) if np.any(rows) else 0.0
     kick = np.zeros((spec.num_bodies, 2))
     if impulse_scale is not None:
         kick = step * np.median(impulse_scale, axis=0)

@@ -189,6 +189,9 @@ def test_noise_above_what_readings_scatter_by_is_named():
 
     assert reasons(own) == []
     assert reasons(2.0 * own) == []
+    none = history_of(rng, np.zeros((1, 3)), capacity=4)
+    known = np.tile(100.0 * own, (4, 1, 1)), prior, kicks
+    assert noise_reasons(scene(), none, *known) == []
     (reason,) = reasons(own * [7.0, 1.0, 1.0, 1.0])
     assert "readings of its position are taken to be off by 0.007 m" in reason
     (reason,) = reasons(own * [1.0, 10.0, 1.0, 1.0])
