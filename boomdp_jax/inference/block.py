@@ -32,11 +32,13 @@ from boomdp_jax.physics.scene_spec import SceneSpec
 # which passed for noise of the motion: with two parts the evidence of six doors that
 # MuJoCo moved rose by 0 to 45 nats, that of eight tables on a floor by -3 to 43.
 _LONGEST_WHOLE_STEP = 0.05
-# Joints between bodies, and rods, turn with them: of two boxes on a pin that turned by
-# 0.45 rad in one part of a step angles were 6 mrad off, and 0.6 with three; a rod's 5
-# and 0.5. So far a part may turn [rad], from a turn in a step on that matters, and the
-# most parts. Pins of a lone body to the world are closer than that by themselves.
-_TURN_OF_PART, _LEAST_TURN, _MOST_PARTS = 0.15, 0.2, 6
+# What a push does by way of a pin, a rod or a wheel turns with the body, and a part of
+# a step takes it as it is in the middle, which leaves out a share of the square of the
+# turn over 24. A lone box on a pin that turned by 0.4 rad a part came out 0.6 % too
+# heavy, by four sds; two boxes on a pin, at 0.45 rad a part, were 6 mrad off after one,
+# a rod 5. So far a part may turn [rad], from a turn in a step on that matters; parts
+# are a power of two, since each number is a program, and so many at most.
+_TURN_OF_PART, _LEAST_TURN, _MOST_PARTS = 0.15, 0.2, 8
 _SHARE_OF_STEPS = 0.9
 """Share of steps in which bodies turn by less than what counts."""
 
@@ -77,8 +79,8 @@ def make_block(
         touching: what may have touched; None: nothing collides.
         freedom: degrees of freedom of the readings' Student-t noise; None: normal.
         is_told: whether readings tell what the bodies are, or only where.
-        cuts_turns: whether steps are cut by how far bodies that joints turn with are
-            read to turn. Not where shapes must not depend on readings.
+        cuts_turns: whether steps are cut by how far bodies are read to turn. Not where
+            shapes must not depend on readings.
 
     Returns:
         The block.
@@ -112,7 +114,7 @@ def make_block(
         raise ValueError(f"{error}; {why}") from None
     poses = _poses(trusted, bodies)
     num_parts = 1
-    if cuts_turns and (len(bodies) > 1 or layout.count("distance")):
+    if cuts_turns:
         num_parts = _parts_of_turns(history, bodies)
     coordinates = Coordinates(
         layout=layout,
@@ -210,7 +212,8 @@ def _parts_of_turns(history: History, bodies: tuple[int, ...]) -> int:
     most = max(turns, default=0.0)
     if most < _LEAST_TURN:
         return 1
-    return min(int(np.ceil(most / _TURN_OF_PART)), _MOST_PARTS)
+    parts = most / _TURN_OF_PART
+    return min(1 << int(np.ceil(np.log2(parts))), _MOST_PARTS)
 
 
 def _block_scene(
