@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.reading_sequence import readings_in_order, scatter
+from boomdp_jax.physics.scene_arrays import has_contact
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 _DEGREE = np.pi / 180.0
@@ -101,10 +102,16 @@ def angle_sense_reasons(spec: SceneSpec, history: History) -> list[str]:
 
     Returns:
         One line for each body of which a point is held to a direction of the body only
-        where angles are taken otherwise than told. What is free shows nothing.
+        where angles are taken otherwise than told. What is free shows nothing; discs,
+        and scenes with contact, are not asked.
     """
     readings, reasons = readings_in_order(spec, history), []
+    # What slides along walls, and discs that go round something, may be held so.
+    if has_contact(spec.bodies):
+        return []
     for body in np.flatnonzero(~np.asarray(spec.is_static)):
+        if spec.bodies[body].radius > 0.0:
+            continue
         moves = _Moves(readings.values[:, body, :3], readings.run)
         if len(moves.away) < 2 * _FEWEST:
             continue

@@ -4,15 +4,18 @@ import numpy as np
 from jaxtyping import Float
 
 from boomdp_jax.core.history import History
-from boomdp_jax.inference.reading_sequence import readings_in_order, scatter
+from boomdp_jax.inference.reading_sequence import (
+    readings_in_order,
+    rounding_step,
+    scatter,
+)
 from boomdp_jax.physics.constraint_spec import JOINTS, ConstraintSpec
 from boomdp_jax.physics.params import WORLD
 from boomdp_jax.physics.scene_spec import SceneSpec
-from boomdp_jax.physics.start_gaps import START_TOLERANCE
 
-# Gaps in most readings that are so many times as large as their noise, and as a
-# rounded number of a file makes them, are no noise.
-_TIMES, _LEAST = 4.0, 3.0 * START_TOLERANCE
+# Gaps in most readings that are so many times as large as their noise, and larger than
+# play and calibration make them, are no noise.
+_TIMES, _LEAST = 4.0, {"m": 5e-3, "rad": 2e-2}
 _WORDS = {"revolute": "pin", "distance": "rod", "prismatic": "guide", "weld": "weld"}
 
 
@@ -36,8 +39,9 @@ def known_joint_reasons(spec: SceneSpec, history: History) -> list[str]:
             noise = scatter(gap, readings.run)
             if not np.any(is_read) or noise is None:
                 continue
+            noise = max(noise, _rounding(joint, readings.values, unit))
             size = float(np.median(np.linalg.norm(gap[is_read], axis=1)))
-            if size > max(_TIMES * noise, _LEAST):
+            if size > max(_TIMES * noise, _LEAST[unit]):
                 other = joint.body_b
                 partner = "the world" if other == WORLD else f"{spec.names[other]!r}"
                 reasons.append(
@@ -75,6 +79,24 @@ def _gaps(
         turned = pose_a[:, 2] - pose_b[:, 2] - float(numbers["angle"])
         gaps.append((np.angle(np.exp(1j * turned))[:, None], "rad"))
     return gaps
+
+
+def _rounding(
+    joint: ConstraintSpec, values: Float[np.ndarray, "reading body 6"], unit: str
+) -> float:
+    """How far rounded readings move what a joint holds [m] or [rad]."""
+    steps = []
+    for body, anchor in (
+        (joint.body_a, joint.numbers["anchor_a"]),
+        (joint.body_b, joint.numbers["anchor_b"]),
+    ):
+        if body == WORLD:
+            continue
+        turn = rounding_step(values[:, body, 2])
+        place = max(rounding_step(values[:, body, part]) for part in (0, 1))
+        lever = float(np.hypot(*np.nan_to_num(np.asarray(anchor, float))))
+        steps.append(turn if unit == "rad" else np.hypot(place, turn * lever))
+    return float(np.sqrt(np.sum(np.square(steps))))
 
 
 def _placed(

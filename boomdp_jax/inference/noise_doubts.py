@@ -13,9 +13,10 @@ from boomdp_jax.core.history import History
 from boomdp_jax.inference.reading_sequence import readings_in_order, scatter
 from boomdp_jax.physics.scene_spec import SceneSpec
 
-# How many times as much as readings scatter by, and at least as a share of what noise
-# is a priori: below that the prior may hold it up.
-_TIMES, _LEAST = 3.0, 0.25
+# How many times as much as readings scatter by, and as noise is a priori, which is all
+# that is said of bodies whose readings were left out.
+_TIMES, _TIMES_PRIOR = 3.0, 1.5
+_MOST_SIZES = 10.0
 _MOST_TURNED = 0.5
 """Chance of a step's turn that leaves next to nothing of an angle [rad]."""
 _GROUPS = (
@@ -43,8 +44,9 @@ def noise_reasons(
         impulse_scale: noise of the motion, draws of the posterior; None: there is none.
 
     Returns:
-        One line for each body and group of channels, and where a body is taken to go
-        further than its own size by chance in one step, or to turn by half a radian.
+        One line for each body and group of channels, and where a body is taken to be
+        off or to go by chance in one step by ten times its own size, or to turn by half
+        a radian.
     """
     readings = readings_in_order(spec, history)
     inferred = np.median(noise_scale, axis=0)
@@ -62,7 +64,7 @@ def noise_reasons(
             found = float(inferred[body, group])
             if bound is None:
                 continue
-            if found > _TIMES * max(bound, _LEAST * float(prior[body, group])):
+            if found > max(_TIMES * bound, _TIMES_PRIOR * float(prior[body, group])):
                 reasons.append(
                     f"{spec.names[body]}: readings of its {name} are taken to be off "
                     f"by {found:.2g} {unit}, though they scatter by {bound:.2g} "
@@ -72,9 +74,10 @@ def noise_reasons(
         shape = spec.bodies[body]
         corners = np.linalg.norm(shape.outline, axis=1)
         reach = float(np.max(corners, initial=0.0)) + shape.radius
+        far = max(kick[body, 0], inferred[body, 0])
         for size, most, name, unit in (
-            (max(kick[body, 0], inferred[body, 0]), reach, "position", "m"),
-            (max(kick[body, 1], inferred[body, 1]), _MOST_TURNED, "angle", "rad"),
+            (far, _MOST_SIZES * reach, "position", "m"),
+            (kick[body, 1], _MOST_TURNED, "angle", "rad"),
         ):
             if size > most:
                 reasons.append(

@@ -370,12 +370,7 @@ class OnlineBelief:
         return structure_share(self._groups.parts(belief.blocks))
 
     def save(self, belief: BeliefState, path: str | os.PathLike) -> None:
-        """Write a belief to an NPZ file, the whole of it or nothing; `load` reads it.
-
-        Args:
-            belief: so far.
-            path: the file.
-        """
+        """Write a belief to an NPZ file, whole or not at all; `load` reads it."""
         write_belief(path, self._for_file(), belief)
 
     def load(self, path: str | os.PathLike) -> BeliefState:
@@ -392,7 +387,10 @@ class OnlineBelief:
                 another scene or with other settings, the first of which is named.
             OSError: the file cannot be opened.
         """
-        begin = functools.partial(self.init, jax.random.key(0))
+
+        def begin(kind: str) -> BeliefState:
+            return self.init(jax.random.key(0, impl=kind))
+
         return read_belief(path, self._for_file(), begin)
 
     def _for_file(self) -> dict:

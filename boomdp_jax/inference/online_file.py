@@ -61,7 +61,12 @@ def write_belief(
         settings: of `settings_for_file`.
         belief: what to write.
     """
-    header = {"schema": SCHEMA, "settings": settings, "versions": library_versions()}
+    header = {
+        "schema": SCHEMA,
+        "settings": settings,
+        "key": str(jax.random.key_impl(belief.key)),
+        "versions": library_versions(),
+    }
     text = json.dumps(header, allow_nan=False)
     arrays = {"header": np.frombuffer(text.encode(), np.uint8)}
     write_npz(path, arrays | _named(belief))
@@ -70,14 +75,15 @@ def write_belief(
 def read_belief(
     path: str | os.PathLike,
     settings: dict[str, Any],
-    make_belief: Callable[[], BeliefState],
+    make_belief: Callable[[str], BeliefState],
 ) -> BeliefState:
     """Read what `write_belief` wrote.
 
     Args:
         path: the file.
         settings: of whoever reads it.
-        make_belief: makes any belief with these settings, which takes its time.
+        make_belief: makes any belief with these settings, which takes its time; of the
+            kind of its random key.
 
     Returns:
         The belief, the same to the bit.
@@ -93,11 +99,14 @@ def read_belief(
         arrays.pop("header", None),
         what="an online belief",
         schema=SCHEMA,
-        fields={"settings": dict, "versions": dict},
+        fields={"settings": dict, "key": str, "versions": dict},
         max_bytes=_MAX_HEADER_BYTES,
     )
     _check_settings(path, header["settings"], settings)
-    like = make_belief()
+    try:
+        like = make_belief(header["key"])
+    except ValueError as error:
+        raise ValueError(f"{path}: key: {error}") from error
     expected = _named(like)
     if arrays.keys() != expected.keys():
         name = min(arrays.keys() ^ expected.keys())
@@ -117,7 +126,8 @@ def read_belief(
         array = arrays[_name(place)]
         leaf = on_device(array, array.dtype)
         is_key = _name(place) == _KEY
-        leaves.append(jax.random.wrap_key_data(leaf) if is_key else leaf)
+        kind = header["key"]
+        leaves.append(jax.random.wrap_key_data(leaf, impl=kind) if is_key else leaf)
     return jax.tree.unflatten(tree, leaves)
 
 

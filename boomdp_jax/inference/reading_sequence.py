@@ -10,6 +10,9 @@ from boomdp_jax.physics.scene_spec import SceneSpec
 
 # Median of the absolute value of a standard normal.
 _MEDIAN = 0.6745
+_FEWEST = 12
+# Share of values that is rounding to single precision.
+_DIGITS = 1e-6
 
 
 class ReadingSequence(NamedTuple):
@@ -56,26 +59,40 @@ def scatter(
     """Standard deviation of the noise of readings, at most.
 
     By how far each is from the line through the ones before and after, of most of them:
-    what a push adds to that only makes it more.
+    what a push adds to that only makes it more. No less than the step of values that
+    were rounded.
 
     Args:
-        values: readings of numbers with the same noise; what is not finite is skipped.
+        values: readings; what is not finite is skipped.
         run: which run each belongs to.
         is_angle: whether whole turns do not count.
 
     Returns:
-        In the unit of the values; None with fewer than twelve such triples.
+        In the unit of the values, the root mean square of the parts'; None where one
+        has fewer than twelve such triples.
     """
-    bends = []
+    squares = []
     for part in values.T:
         is_read = np.isfinite(part)
         own, of = part[is_read], run[is_read]
         change = np.diff(own)
         if is_angle:
             change = np.angle(np.exp(1j * change))
-        bend = np.diff(change)
-        bends.append(bend[of[2:] == of[:-2]])
-    joined = np.abs(np.concatenate(bends))
-    if len(joined) < 12:
-        return None
-    return float(np.median(joined)) / (_MEDIAN * np.sqrt(6.0))
+        bend = np.abs(np.diff(change)[of[2:] == of[:-2]])
+        if len(bend) < _FEWEST:
+            return None
+        sd = float(np.median(bend)) / (_MEDIAN * np.sqrt(6.0))
+        squares.append(max(sd, rounding_step(own)) ** 2)
+    return float(np.sqrt(np.mean(squares)))
+
+
+def rounding_step(values: np.ndarray) -> float:
+    """The least by which two of some values differ, but for rounding of their digits.
+
+    Args:
+        values: any number; what is not finite is skipped.
+    """
+    levels = np.unique(values[np.isfinite(values)])
+    step = np.diff(levels)
+    step = step[step > _DIGITS * np.max(np.abs(levels), initial=0.0)]
+    return float(np.min(step, initial=np.inf)) if len(step) else 0.0

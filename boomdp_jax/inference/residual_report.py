@@ -24,7 +24,8 @@ _GROWTH_BY_CHANCE = 1e-4
 # came near (0.18 and 7e-2 with poses alone, 0.4 and 1e-2 with all channels); of 18
 # recordings in which something was other than told (a limit of the actuator, degrees,
 # millimetres, angles counted the other way round, a known pin elsewhere) 12 did.
-_CORRELATED, _CORRELATED_BY_CHANCE = 0.3, 1e-8
+# Trackers that smooth have noise with correlations of 0.4 and more: a note.
+_CORRELATED, _CORRELATED_BY_CHANCE = 0.55, 1e-8
 # Laws of each block that are listed.
 _MOST_LAWS = 3
 _NUM_GROUPS = 4

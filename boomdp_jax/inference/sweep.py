@@ -272,6 +272,8 @@ class Sweep:
     def is_done(self, unit: int) -> bool:
         """Whether a unit's files are there, whole; objects that failed count as done.
 
+        Not where one that failed has another recording now: all are done again then.
+
         Raises:
             ValueError: they are, and were made from other recordings or scenes.
         """
@@ -280,11 +282,10 @@ class Sweep:
         paths = {number: self._path(number) for number in numbers}
         if record is None or not record.is_whole(paths):
             return False
-        for number, known in zip(numbers, record.inputs, strict=True):
-            if known != self._input_hash(number):
-                source = self.histories[number]
-                raise other_input(self._record(unit), number, source)
-        return True
+        others, is_mended = record.changes({n: self._input_hash(n) for n in numbers})
+        for number in others:
+            raise other_input(self._record(unit), number, self.histories[number])
+        return not is_mended
 
     def failed(self, unit: int) -> dict[int, str]:
         """Objects of a unit that inference refused: a line for each, by its number."""

@@ -58,6 +58,21 @@ class UnitRecord(NamedTuple):
                 return False
         return True
 
+    def changes(self, inputs: Mapping[int, str]) -> tuple[list[int], bool]:
+        """What has changed since a unit was done.
+
+        Args:
+            inputs: hash of each object's recording and scene now, by its number.
+
+        Returns:
+            Objects with a posterior of other inputs, and whether one that inference
+            refused has others now, which may be better ones.
+        """
+        known = zip(inputs.items(), self.inputs, strict=True)
+        changed = [number for (number, now), then in known if now != then]
+        others = [number for number in changed if str(number) not in self.failed]
+        return others, len(others) < len(changed)
+
     def failures(self, numbers: Sequence[int]) -> dict[int, str]:
         """Why inference refused objects of a unit, by number, in order."""
         return {n: self.failed[str(n)] for n in numbers if str(n) in self.failed}

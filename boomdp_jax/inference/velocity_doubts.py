@@ -13,6 +13,8 @@ from boomdp_jax.physics.scene_spec import SceneSpec
 # them turned by its angle than as told. Of the way from the one to the other that rates
 # are at, the median is one; where velocities are noise alone, one half.
 _SDS, _LEAST_TURNED = 4.0, 0.75
+# How far a body may go round in a row [rad].
+_MOST_ROUND = 1.5
 
 
 def velocity_reasons(spec: SceneSpec, history: History) -> list[str]:
@@ -56,7 +58,10 @@ def _is_along_own_axes(history: History, body: int) -> bool:
     turned = 0.5 * (_turned(steps.first, angle) + _turned(steps.last, last))
     apart = turned - steps.mean
     size = np.sum(apart**2, axis=1)
-    use = size > 0.0
+    # Of a body that goes far round in a row neither mean says anything.
+    spin = np.where(history.state_mask, history.state, np.nan)[steps.index, body, 5]
+    round_ = np.fmax(np.abs(last - angle), np.abs(spin) * steps.dt)
+    use = (size > 0.0) & ~(round_ > _MOST_ROUND)
     num = int(np.sum(use))
     if num == 0:
         return False

@@ -43,6 +43,11 @@ def test_a_belief_comes_back_to_the_bit(written: Path):
     found = online.load(written)
     assert same_bits(found, online.init(jax.random.key(3)))
     assert not same_bits(found, online.init(jax.random.key(4)))
+    other = online.init(jax.random.key(3, impl="rbg"))
+    online.save(other, written.with_name("other.npz"))
+    found = online.load(written.with_name("other.npz"))
+    assert same_bits(found, other)
+    assert found.key.dtype == other.key.dtype
 
 
 @pytest.mark.slow

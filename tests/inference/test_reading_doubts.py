@@ -30,6 +30,15 @@ def scene(*constraints: dict, num: int = 1, shape: dict = BOX) -> SceneSpec:
     )
 
 
+def beside_a_wall() -> SceneSpec:
+    """A box that may touch something."""
+    contact = {"contact": {"friction": 0.5, "restitution": 0.0}}
+    box = {"name": "box0", "shape": BOX, **contact}
+    wall = {"name": "wall", "shape": BOX, "static": True, "pose": [5, 0, 0], **contact}
+    scene = {"schema": "planar-scene-1", "dt": DT, "bodies": [box, wall]}
+    return scene_spec_from_dict(scene | {"unknown": {"ground": 1}}, source="test")
+
+
 def swing(rng: np.random.Generator, num: int) -> np.ndarray:
     """Angles of something that is turned to and fro, smooth at every reading."""
     time = DT * np.arange(num)
@@ -85,7 +94,7 @@ WORDS = {
 def test_angles_that_are_read_otherwise_are_named(kind: str, sense: str, seed: int):
     """With noise; wrapped, where they are degrees, to within a turn as well."""
     rng = np.random.default_rng([1, seed])
-    angle = swing(rng, 81)
+    angle = 1.5 * swing(rng, 81)
     poses = pinned(angle) if kind == "pin" else rolling(rng, angle)
     spec = scene()
     assert angle_sense_reasons(spec, history_of(rng, poses)) == []
@@ -181,21 +190,24 @@ def test_noise_above_what_readings_scatter_by_is_named():
     rng = np.random.default_rng(6)
     history = history_of(rng, pinned(swing(rng, 81)), noise=NOISE)
     own = np.array([1e-3, 2e-3, 1.0, 1.0])
-    prior, kicks = np.full((4, 1, 4), 1e-3), np.full((4, 1, 2), 1e-3)
+    kicks = np.full((4, 1, 2), 1e-3)
 
-    def reasons(scale, shape=BOX):
-        known = np.tile(scale, (4, 1, 1)), prior, kicks
+    def reasons(scale, shape=BOX, prior=1e-3):
+        known = np.tile(scale, (4, 1, 1)), np.full((4, 1, 4), prior), kicks
         return noise_reasons(scene(shape=shape), history, *known)
 
     assert reasons(own) == []
     assert reasons(2.0 * own) == []
     none = history_of(rng, np.zeros((1, 3)), capacity=4)
-    known = np.tile(100.0 * own, (4, 1, 1)), prior, kicks
+    known = np.tile(100.0 * own, (4, 1, 1)), np.full((4, 1, 4), 1e-3), kicks
     assert noise_reasons(scene(), none, *known) == []
     (reason,) = reasons(own * [7.0, 1.0, 1.0, 1.0])
     assert "readings of its position are taken to be off by 0.007 m" in reason
     (reason,) = reasons(own * [1.0, 10.0, 1.0, 1.0])
     assert "readings of its angle" in reason
+    # What the prior says is all that is known of bodies whose readings are left out.
+    assert reasons(own * [7.0, 1.0, 1.0, 1.0], prior=5e-3) == []
+    assert len(reasons(own * [7.0, 1.0, 1.0, 1.0], prior=4e-3)) == 1
     # Whatever readings scatter by, as where they are millimetres or degrees.
     kicks[..., 1] = 19.0
     (reason,) = reasons(own)
@@ -203,10 +215,65 @@ def test_noise_above_what_readings_scatter_by_is_named():
     kicks[...] = [209.0, 1e-3]
     (reason,) = reasons(own)
     assert "its position is taken to be off or to change by chance by 10 m" in reason
-    kicks[..., 0] = 170.0
+    # A disc of 9 m.
+    kicks[..., 0] = 1700.0
     assert reasons(own, DISC) == []
-    kicks[..., 0] = 190.0
+    kicks[..., 0] = 1900.0
     assert len(reasons(own, DISC)) == 1
+    kicks = None
+    assert reasons(own) == []
+
+
+def test_what_is_rounded_or_finer_along_one_axis_is_no_alarm():
+    """Rounded to 1 degree and 5 mm; noise of 20 mm along x and 0.2 mm along y."""
+    rng = np.random.default_rng(8)
+    poses = pinned(0.3 * swing(rng, 81))
+    known = scene(joint("revolute", "world"))
+    rounded = poses.copy()
+    rounded[:, :2] = 5e-3 * np.round(poses[:, :2] / 5e-3)
+    rounded[:, 2] = np.radians(np.round(np.degrees(poses[:, 2])))
+    prior = np.full((4, 1, 4), 1e-3)
+    for readings, own in (
+        (history_of(rng, rounded, noise=0.0), [1.5e-3, 5e-3, 1.0, 1.0]),
+        (history_of(rng, poses, noise=np.array([0.02, 2e-4, 0])), [0.014, 1e-3, 1, 1]),
+        (history_of(rng, poses, noise=0.0), [1e-3, 1e-3, 1.0, 1.0]),
+    ):
+        assert known_joint_reasons(known, readings) == []
+        scale = np.tile(own, (4, 1, 1))
+        assert noise_reasons(scene(), readings, scale, prior, None) == []
+
+
+def test_what_moves_straight_while_it_turns_says_nothing_of_angles():
+    """With noise and without; nor do discs, or what may slide along a wall."""
+    rng = np.random.default_rng(9)
+    angle = 2.0 * swing(rng, 121)
+    along = swing(rng, 121)
+    straight = np.column_stack([along, 0.4 * along, angle])
+    # As a ladder that slides in a corner: its middle goes round against its turning.
+    ladder = np.column_stack([np.cos(angle), np.sin(angle), -angle])
+    for noise in (0.0, NOISE):
+        history = history_of(rng, straight, noise=noise)
+        assert angle_sense_reasons(scene(), history) == []
+        history = history_of(rng, ladder, noise=noise)
+        assert len(angle_sense_reasons(scene(), history)) == 1
+        assert angle_sense_reasons(scene(shape=DISC), history) == []
+        history = history_of(rng, ladder, 0.0 * ladder, noise=noise)
+        assert angle_sense_reasons(beside_a_wall(), history) == []
+
+
+def test_a_guide_that_moves_is_held_against_where_it_is():
+    """The second box slides in the first, which turns."""
+    rng = np.random.default_rng(10)
+    rail = rolling(rng, swing(rng, 81))
+    slide = 0.3 * swing(rng, 81)
+    turn = np.column_stack([np.cos(rail[:, 2] + 0.4), np.sin(rail[:, 2] + 0.4)])
+    box = np.column_stack([rail[:, :2] + slide[:, None] * turn, rail[:, 2]])
+    ends = {"anchor_a": [0.0, 0.0], "anchor_b": [0.0, 0.0]}
+    guide = joint("prismatic", "box1", **ends, axis=0.4)
+    history = history_of(rng, box, rail)
+    assert known_joint_reasons(scene(guide, num=2), history) == []
+    (reason,) = known_joint_reasons(scene(guide | {"axis": 0.6}, num=2), history)
+    assert "off its known guide to 'box1'" in reason
 
 
 def test_scatter_bounds_noise_from_above():

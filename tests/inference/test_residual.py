@@ -191,11 +191,11 @@ def test_reports_say_the_law_in_words_and_numbers():
 @pytest.mark.parametrize(
     ("size", "by_chance", "is_reason", "is_note"),
     [
-        (0.5, 1e-12, True, False),
-        (0.5, 1e-5, False, True),
-        (0.1, 1e-12, False, True),
-        (-0.5, 1e-12, False, True),
-        (0.5, 0.1, False, False),
+        (0.6, 1e-12, True, False),
+        (0.6, 1e-5, False, True),
+        (0.5, 1e-12, False, True),
+        (-0.6, 1e-12, False, True),
+        (0.6, 0.1, False, False),
     ],
 )
 def test_what_goes_on_from_reading_to_reading_is_a_doubt(

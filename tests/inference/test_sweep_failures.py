@@ -135,9 +135,8 @@ def test_what_is_left_of_another_try_is_removed(tmp_path: Path, calls: list):
     assert not any(path.exists() for path in left)
 
 
-def test_another_recording_in_place_of_a_bad_one_is_refused_before_the_work(
-    tmp_path: Path, calls: list
-):
+def test_a_bad_recording_that_is_mended_is_taken_up(tmp_path: Path, calls: list):
+    """Its unit comes to what it would have been; one that was good stays refused."""
     files = [tmp_path / f"{number}.npz" for number in range(4)]
     for path, history in zip(files, with_bad(3, num=4), strict=True):
         save_history(path, history)
@@ -150,8 +149,15 @@ def test_another_recording_in_place_of_a_bad_one_is_refused_before_the_work(
     # Said when the shard begins, and not again when its turn comes.
     (warning,) = warned
     assert "overrides the scene's" in str(warning.message)
-    (folder / "unit-000000.json").unlink()
     save_history(files[3], recordings(4)[3])
+    num_calls = len(calls)
+    found = sweep_all(folder, files, batch=2)
+    assert calls[num_calls:] == [2]
+    expected = sweep_all(tmp_path / "at once", files, batch=2)
+    assert [path.name for path in found] == [path.name for path in expected]
+    assert_same_arrays(folder, tmp_path / "at once", 4)
+    (folder / "unit-000000.json").unlink()
+    save_history(files[3], recordings(4)[2])
     num_calls = len(calls)
     with pytest.raises(ValueError, match=r"unit-000001.json: inputs: object 3 .*3.npz"):
         sweep_all(folder, files, batch=2)
