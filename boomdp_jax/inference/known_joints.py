@@ -10,13 +10,13 @@ from boomdp_jax.inference.reading_sequence import (
     scatter,
 )
 from boomdp_jax.physics.constraint_spec import JOINTS, ConstraintSpec
+from boomdp_jax.physics.joint_gaps import JOINT_WORDS, joint_gaps
 from boomdp_jax.physics.params import WORLD
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 # Gaps in most readings that are so many times as large as their noise, and larger than
 # play and calibration make them, are no noise.
 _TIMES, _LEAST = 4.0, {"m": 5e-3, "rad": 2e-2}
-_WORDS = {"revolute": "pin", "distance": "rod", "prismatic": "guide", "weld": "weld"}
 
 
 def known_joint_reasons(spec: SceneSpec, history: History) -> list[str]:
@@ -46,9 +46,9 @@ def known_joint_reasons(spec: SceneSpec, history: History) -> list[str]:
                 partner = "the world" if other == WORLD else f"{spec.names[other]!r}"
                 reasons.append(
                     f"{spec.names[joint.body_a]}: its readings are {size:.2g} {unit} "
-                    f"off its known {_WORDS[joint.kind]} to {partner}, with noise of "
-                    f"{noise:.2g} {unit} at most; expected anchors, angles and lengths "
-                    "as the recording has them"
+                    f"off its known {JOINT_WORDS[joint.kind]} to {partner}, with noise "
+                    f"of {noise:.2g} {unit} at most; expected anchors, angles and "
+                    "lengths as the recording has them"
                 )
     return reasons
 
@@ -63,22 +63,10 @@ def _gaps(
     pose_a = values[:, joint.body_a, :3]
     is_world = joint.body_b == WORLD
     pose_b = np.zeros_like(pose_a) if is_world else values[:, joint.body_b, :3]
-    numbers = joint.numbers
-    offset = _placed(pose_a, numbers["anchor_a"]) - _placed(pose_b, numbers["anchor_b"])
-    gaps = []
-    if joint.kind == "distance":
-        length = np.hypot(offset[:, 0], offset[:, 1]) - float(numbers["length"])
-        gaps.append((length[:, None], "m"))
-    elif joint.kind == "prismatic":
-        angle = pose_b[:, 2] + float(numbers["axis"])
-        across = np.cos(angle) * offset[:, 1] - np.sin(angle) * offset[:, 0]
-        gaps.append((across[:, None], "m"))
-    else:
-        gaps.append((offset, "m"))
-    if joint.kind in ("prismatic", "weld"):
-        turned = pose_a[:, 2] - pose_b[:, 2] - float(numbers["angle"])
-        gaps.append((np.angle(np.exp(1j * turned))[:, None], "rad"))
-    return gaps
+    return [
+        (np.angle(np.exp(1j * gap)) if unit == "rad" else gap, unit)
+        for gap, unit in joint_gaps(joint.kind, joint.numbers, pose_a, pose_b)
+    ]
 
 
 def _rounding(
@@ -97,12 +85,3 @@ def _rounding(
         lever = float(np.hypot(*np.nan_to_num(np.asarray(anchor, float))))
         steps.append(turn if unit == "rad" else np.hypot(place, turn * lever))
     return float(np.sqrt(np.sum(np.square(steps))))
-
-
-def _placed(
-    pose: Float[np.ndarray, "reading 3"], anchor: Float[np.ndarray, "2"]
-) -> Float[np.ndarray, "reading 2"]:
-    """Where an anchor is in the world."""
-    cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-    x, y = np.asarray(anchor, float)
-    return pose[:, :2] + np.column_stack([cos * x - sin * y, sin * x + cos * y])
