@@ -46,11 +46,14 @@ def _table(report: dict) -> str:
         if not report["num_starts"][horizon]:
             lines.append(
                 f"{horizon:>6} steps: nothing to predict from; expected rows whose "
-                "state was read in all channels of all bodies, followed by as many "
-                "rows of their run, got none"
+                "state was read in all channels of all bodies, or whose poses were "
+                "read twice until then, followed by as many rows of their run, got "
+                "none"
             )
         elif all(each["rmse"] is None for each in quantities.values()):
             lines.append(f"{horizon:>6} steps: nothing was read so many steps later")
+    if report.get("starts") == "filtered":
+        lines.append("no reading was whole: predicted from all readings until then")
     return "\n".join(lines)
 
 

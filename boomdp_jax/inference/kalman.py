@@ -159,19 +159,16 @@ class RowFilter:
         return Estimate(jnp.zeros((self._num // 6, 6)), jnp.eye(self._num))
 
     @full_precision
+    def at_start(self, before: Estimate, row: TrackRow) -> Estimate:
+        """What is known at the start of a row, all readings until then taken in."""
+        return self._begun(before, row)[1][0]
+
+    @full_precision
     def __call__(self, before: Estimate, row: TrackRow) -> tuple[Estimate, FilteredRow]:
         """Filter one row."""
-        begin, num = row.is_start > 0, self._num
-        known = start_factor(self._freedom) * self._scale
-        first_sd = jnp.where(row.first_mask.reshape(-1) > 0, known, self._unknown)
-        estimate = Estimate(
-            jnp.where(begin, row.start, before.mean),
-            jnp.where(begin, jnp.diag(first_sd**2), before.covariance),
-        )
-        start = estimate.mean
-        (state, covariance), first_gain, first_whitening, first_density = self._update(
-            estimate, row.first, row.is_second
-        )
+        num = self._num
+        start, first = self._begun(before, row)
+        (state, covariance), first_gain, first_whitening, first_density = first
         offset = neighbour_scales(self._scale, jnp.diagonal(covariance))
         offsets = jnp.diag(offset).reshape(num, *state.shape)
         points = jnp.concatenate([state[None], state[None] + offsets])
@@ -186,6 +183,17 @@ class RowFilter:
         gains = Gains(first_gain, last_gain, first_whitening, last_whitening)
         density = first_density + last_density
         return estimate, FilteredRow(gains, density, start, slope)
+
+    def _begun(self, before: Estimate, row: TrackRow):
+        """Mean before the first reading, and what that reading makes of it."""
+        begin = row.is_start > 0
+        known = start_factor(self._freedom) * self._scale
+        first_sd = jnp.where(row.first_mask.reshape(-1) > 0, known, self._unknown)
+        estimate = Estimate(
+            jnp.where(begin, row.start, before.mean),
+            jnp.where(begin, jnp.diag(first_sd**2), before.covariance),
+        )
+        return estimate.mean, self._update(estimate, row.first, row.is_second)
 
     @full_precision
     def _update(self, estimate: Estimate, reading, mask):

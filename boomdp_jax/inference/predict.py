@@ -1,9 +1,9 @@
 """How well a posterior predicts held-out motion, several steps ahead.
 
-From every reading inside an episode, draws of the posterior are rolled out under the
-recorded wrenches. A prediction is uncertain for three reasons, and all are drawn: which
-hypothesis holds, where the bodies truly were when they were read at the start, and how
-the reading at the end will err.
+From every row of an episode whose start is known, draws of the posterior are rolled out
+under the recorded wrenches. A prediction is uncertain for three reasons, and all are
+drawn: which hypothesis holds, where the bodies truly were at the start, and how the
+reading at the end will err.
 """
 
 import functools
@@ -15,13 +15,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.core.checked_input import whole_number
 from boomdp_jax.core.history import History
 from boomdp_jax.core.quick_compile import KeptJit
 from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.prediction_starts import PredictionStarts
 from boomdp_jax.inference.random_motion import add_impulse, add_reading_noise
 from boomdp_jax.inference.summary import CHANNELS, plain
 from boomdp_jax.physics import Params, Scene, rollout, state_from_array, step
@@ -41,11 +42,14 @@ def predict(
     *,
     num_draws: int = 128,
     key: Key | None = None,
+    starts: str = "auto",
 ) -> dict:
     """Score predictions at several horizons.
 
-    A start is a row whose reading has every channel of every body that can move and
-    that is followed by enough rows of its episode. Readings at the end count channel by
+    A start is a row that is followed by enough rows of its episode, and whose reading
+    has every channel of every body that can move; or, `filtered`, at or before which
+    every pose was read twice in that episode: from readings until then each draw's
+    filter says where the bodies are and how fast. Readings at the end count channel by
     channel. Angles are compared as they are, not modulo a turn, as files hold them
     unwrapped.
 
@@ -56,18 +60,23 @@ def predict(
         num_draws: draws rolled out from each start; of a posterior with fewer each is,
             with noise of its own, as often as it takes.
         key: random key; default: that of seed 0.
+        starts: `readings`, `filtered`, or `auto`: the former where there is a whole
+            reading to start from, else the latter.
 
     Returns:
         A `boomdp-predict-1` object. By horizon and channel: `rmse` of the predictive
         mean (of the distance, for position [m] and velocity [m/s]; of the angle [rad]
         and spin [rad/s]), `coverage90` of central 90 % intervals, `log_score`: mean log
         predictive density of a number, of the normal with the draws' mean and
-        variance, and `baseline_rmse` of constant velocity; None where nothing could
-        be scored. By horizon, `num_starts`: rows that were predicted from.
+        variance, and `baseline_rmse` of constant velocity (that between the
+        last two readings of a pose, where it was not read); None where nothing could
+        be scored. By horizon, `num_starts`: rows that were predicted from. `starts`:
+        `readings` or `filtered`.
 
     Raises:
         ValueError: a horizon that is no whole number or under one, too few draws,
-            another number of bodies, or a history without rows.
+            another number of bodies, starts that are none of the above, or a history
+            without rows.
     """
     horizons = _sorted_horizons(horizons)
     num_draws = whole_number("num_draws", num_draws, 2)
@@ -82,6 +91,9 @@ def predict(
     key = jax.random.key(0) if key is None else key
     kept = _enough_draws(posterior, num_draws)
     scene = posterior.spec.scene
+    table = jax.tree.map(np.asarray, history)
+    is_static = np.asarray(scene.is_static)
+    known = PredictionStarts(starts, key, kept, history)
     moments = _predict_rows(
         key,
         scene,
@@ -89,21 +101,22 @@ def predict(
         kept.noise_scale,
         kept.impulse_scale,
         history,
-        _in_effect(kept.params, history),
+        commands_in_effect(kept.params, history),
         tuple(horizons),
         posterior.degrees_of_freedom,
+        known.state,
     )
     moments = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), moments)
-    table = jax.tree.map(np.asarray, history)
-    is_static = np.asarray(scene.is_static)
-    report = {}
+    report, counts = {}, {}
     for place, horizon in enumerate(horizons):
         at_horizon = {name: leaf[:, place] for name, leaf in moments.items()}
-        at_horizon["baseline"] = constant_velocity(table, horizon)
+        at_horizon["baseline"] = known.baseline(horizon)
+        rows = known.rows(horizon)
+        counts[str(horizon)] = len(rows)
         with np.errstate(over="ignore", invalid="ignore"):
-            report[str(horizon)] = _score(at_horizon, table, horizon, is_static)
-    counts = {str(h): len(usable_starts(table, h, is_static)) for h in horizons}
-    return plain({"schema": SCHEMA, "horizons": report, "num_starts": counts})
+            report[str(horizon)] = _score(at_horizon, table, rows, horizon, is_static)
+    out = {"schema": SCHEMA, "horizons": report, "num_starts": counts}
+    return plain(out | {"starts": known.name})
 
 
 def _enough_draws(posterior: Posterior, num_draws: int) -> Posterior:
@@ -145,6 +158,7 @@ def sample_readings(
     places: Int[Array, " place"],
     impulse_scale: Float[Array, "draw body 2"] | None = None,
     freedom: float | None = None,
+    is_true: bool = False,
 ) -> Float[Array, "draw place body 6"]:
     """Draw what may be read later, one trajectory for each hypothesis.
 
@@ -159,14 +173,17 @@ def sample_readings(
         places: after which steps to read, counted from 0.
         impulse_scale: noise of the motion [m/s, rad/s]; None: it has none.
         freedom: degrees of freedom of the readings' Student-t noise; None: normal.
+        is_true: whether `reading` is where each trajectory truly starts.
 
     Returns:
         Readings at those places.
     """
     start_key, end_key, kick_key = jax.random.split(key, 3)
-    start = add_reading_noise(
-        start_key, state_from_array(reading), noise_scale, scene.is_static, freedom
-    )
+    start = state_from_array(reading)
+    if not is_true:
+        start = add_reading_noise(
+            start_key, start, noise_scale, scene.is_static, freedom
+        )
 
     def advance(params, state, wrenches, dt, impulse_scale, key):
         if impulse_scale is None:
@@ -208,6 +225,7 @@ def _predict_rows(
     actions: Float[Array, "draw time body 3"] | None,
     horizons: tuple[int, ...],
     freedom: float | None,
+    states: Float[Array, "draw time body 6"] | None,
 ) -> dict[str, Float[Array, "time horizon body 6"]]:
     """Moments and interval of the predictive distribution from every row.
 
@@ -232,7 +250,7 @@ def _predict_rows(
             scene,
             jax.tree.map(lambda leaf: leaf[draw], params),
             noise_scale[draw],
-            history.state[row],
+            history.state[row] if states is None else states[draw, row],
             history.action[following]
             if actions is None
             else actions[draw[:, None], following],
@@ -240,6 +258,7 @@ def _predict_rows(
             places,
             None if impulse_scale is None else impulse_scale[draw],
             freedom,
+            is_true=states is not None,
         ).reshape(num_starts, num_draws, *places.shape, -1, 6)
         low, high = jnp.quantile(readings, _levels(num_draws), axis=1)
         return {
@@ -267,10 +286,18 @@ def _levels(num_draws: int) -> Float[Array, "2"]:
     return jnp.clip(ranks / (num_draws - 1), 0.0, 1.0)
 
 
-def _in_effect(
+def commands_in_effect(
     params: Params, history: History
 ) -> Float[Array, "draw time body 3"] | None:
-    """Commands as they take effect by each draw; None: at once."""
+    """Commands as they take effect by each draw.
+
+    Args:
+        params: hypotheses with a leading draw axis.
+        history: what was commanded.
+
+    Returns:
+        Wrenches [N, N, N m]; None where none is delayed.
+    """
     if params.actuator is None or params.actuator.delay is None:
         return None
     table = jax.tree.map(np.asarray, history)
@@ -279,59 +306,14 @@ def _in_effect(
     return jax.lax.map(lambda one: delayed(one, commands), params)
 
 
-def constant_velocity(
-    history: History, horizon: int
-) -> Float[np.ndarray, "time body 6"]:
-    """Predict from every row that bodies go on as they were read.
-
-    Args:
-        history: the table.
-        horizon: steps ahead.
-
-    Returns:
-        Readings after so many steps; past the end of the table, whatever.
-    """
-    state = np.asarray(history.state, np.float64)
-    time = np.concatenate([[0.0], np.cumsum(np.asarray(history.dt, np.float64))])
-    rows = np.arange(len(state))
-    elapsed = time[np.minimum(rows + horizon, len(state))] - time[rows]
-    pose = state[..., :3] + elapsed[:, None, None] * state[..., 3:]
-    return np.concatenate([pose, state[..., 3:]], axis=-1)
-
-
-def usable_starts(
-    history: History, horizon: int, is_static: Bool[np.ndarray, " body"]
-) -> Int[np.ndarray, " start"]:
-    """Rows with a complete reading and enough rows of their episode to follow.
-
-    Args:
-        history: the table.
-        horizon: rows needed, the start's own included.
-        is_static: bodies whose readings do not matter.
-
-    Returns:
-        Indices of rows, ascending.
-    """
-    mask, episode = np.asarray(history.mask), np.asarray(history.episode)
-    num_starts = len(mask) - horizon + 1
-    if num_starts < 1:
-        return np.zeros(0, int)
-    is_whole = np.all(np.asarray(history.state_mask)[:, ~is_static], axis=(1, 2))
-    is_usable = np.array(is_whole[:num_starts])
-    for offset in range(horizon):
-        end = offset + num_starts
-        is_usable &= mask[offset:end] & (episode[offset:end] == episode[:num_starts])
-    return np.flatnonzero(is_usable)
-
-
 def _score(
     moments: dict[str, np.ndarray],
     history: History,
+    starts: np.ndarray,
     horizon: int,
     is_static: np.ndarray,
 ) -> dict:
     """Compare predictions with what was read at one horizon."""
-    starts = usable_starts(history, horizon, is_static)
     ends = starts + horizon - 1
     moving = ~is_static
     reading = history.next_state[ends][:, moving].astype(np.float64)
@@ -349,6 +331,7 @@ def _score(
         value = reading[..., columns][there]
         part = {name: leaf[..., columns][there] for name, leaf in chosen.items()}
         error, drift = value - part["mean"], value - part["baseline"]
+        drift = drift[np.isfinite(drift)]
         variance = np.maximum(part["variance"], np.finfo(np.float32).tiny)
         inside = (part["low"] <= value) & (value <= part["high"])
         density = -0.5 * (error**2 / variance + np.log(2.0 * math.pi * variance))
@@ -356,6 +339,8 @@ def _score(
             "rmse": math.sqrt(len(columns) * np.mean(error**2)),
             "coverage90": float(np.mean(inside)),
             "log_score": float(np.mean(density)),
-            "baseline_rmse": math.sqrt(len(columns) * np.mean(drift**2)),
+            "baseline_rmse": math.sqrt(len(columns) * np.mean(drift**2))
+            if drift.size
+            else None,
         }
     return report

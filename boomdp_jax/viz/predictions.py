@@ -10,10 +10,11 @@ from boomdp_jax.core.arrays import Key
 from boomdp_jax.core.history import History
 from boomdp_jax.core.quick_compile import KeptJit
 from boomdp_jax.inference.posterior import Posterior
-from boomdp_jax.inference.predict import sample_readings, usable_starts
+from boomdp_jax.inference.predict import commands_in_effect, sample_readings
+from boomdp_jax.inference.prediction_starts import PredictionStarts
 from boomdp_jax.viz.style import BASELINE, PREDICTION, READING
 
-_sample = KeptJit(sample_readings)
+_sample = KeptJit(sample_readings, static=("freedom", "is_true"))
 
 _LABELS = {
     "x": "x [m]",
@@ -53,12 +54,15 @@ def draw_prediction(
         key: random key; default: that of seed 0.
 
     Raises:
-        ValueError: no row has a complete reading to start from, too few rows follow
-            the start, or there is no such quantity.
+        ValueError: no row has a complete reading to start from, or two of each pose
+            before it, too few rows follow the start, or there is no such quantity.
     """
     spec, scene = posterior.spec, posterior.spec.scene
     is_static = np.array([entry.is_static for entry in spec.bodies])
-    starts, num_steps = _starts(history, num_steps, is_static)
+    key = jax.random.key(0) if key is None else key
+    kept = posterior.thin(num_draws)
+    known = PredictionStarts("auto", key, kept, history)
+    starts, num_steps = _starts(known, num_steps, history.capacity)
     if start is None:
         start = _liveliest(history, starts, num_steps, is_static)
     rows = np.arange(start, start + num_steps)
@@ -67,23 +71,27 @@ def draw_prediction(
             f"start: expected {num_steps} rows after it, got row {start} of "
             f"{history.capacity}"
         )
-    reading, following = history.state[start], np.asarray(history.next_state)[rows]
-    body, quantity = _choose(np.asarray(reading), following, is_static, body, quantity)
+    reading, following = known.baseline(0)[start], np.asarray(history.next_state)[rows]
+    body, quantity = _choose(reading, following, is_static, body, quantity)
     if quantity not in _LABELS:
         raise ValueError(f"quantity: expected one of {_COLUMNS}, got {quantity!r}")
     column = _COLUMNS.index(quantity)
-    kept = posterior.thin(num_draws)
     count = kept.num_draws
+    begin = history.state[start][None] if known.state is None else known.state[:, start]
+    commands = commands_in_effect(kept.params, history)
+    action = history.action[None] if commands is None else commands
     draws = _sample(
-        jax.random.key(0) if key is None else key,
+        key,
         scene,
         spec.with_surface(kept.params),
         kept.noise_scale,
-        jnp.broadcast_to(reading, (count, *reading.shape)),
-        jnp.broadcast_to(history.action[rows], (count, *history.action[rows].shape)),
+        jnp.broadcast_to(begin, (count, *begin.shape[1:])),
+        jnp.broadcast_to(action, (count, *action.shape[1:]))[:, rows],
         jnp.broadcast_to(history.dt[rows], (count, num_steps)),
         jnp.arange(num_steps),
         kept.impulse_scale,
+        freedom=posterior.degrees_of_freedom,
+        is_true=known.state is not None,
     )
     time = np.concatenate([[0.0], np.cumsum(np.asarray(history.dt)[rows])])
     first = float(reading[body, column])
@@ -111,9 +119,11 @@ def draw_prediction(
         label="constant velocity",
     )
     is_read = np.asarray(history.next_state_mask)[rows, body, column]
-    seen = np.append(first, following[is_read, body, column])
+    seen, at = following[is_read, body, column], time[1:][is_read]
+    if history.state_mask[start, body, column]:
+        seen, at = np.append(first, seen), np.append(0.0, at)
     ax.plot(
-        np.append(0.0, time[1:][is_read]),
+        at,
         seen,
         linestyle="",
         marker="o",
@@ -130,14 +140,17 @@ def draw_prediction(
 
 
 def _starts(
-    history: History, num_steps: int, is_static: np.ndarray
+    known: PredictionStarts, num_steps: int, num_rows: int
 ) -> tuple[np.ndarray, int]:
     """Rows to start from, with as many steps as an episode allows."""
-    for length in range(min(num_steps, history.capacity), 0, -1):
-        starts = usable_starts(history, length, is_static)
+    for length in range(min(num_steps, num_rows), 0, -1):
+        starts = known.rows(length)
         if len(starts):
             return starts, length
-    raise ValueError("history: expected a row with a complete reading, got none")
+    raise ValueError(
+        "history: expected a row with a complete reading, or one until which every "
+        "pose was read twice, got none"
+    )
 
 
 def _liveliest(

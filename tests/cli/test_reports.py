@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+# Before parts of it are replaced: it is made of them.
+import boomdp_jax.inference  # noqa: F401
 from boomdp_jax.cli.main import main
 from boomdp_jax.cli.predict import _table
 from boomdp_jax.physics.scene_spec import scene_spec_from_dict
@@ -159,8 +161,12 @@ def test_predict_says_why_nothing_is_scored():
             "20": {"position": none},
         },
         "num_starts": {"1": 7, "5": 3, "20": 0},
+        "starts": "readings",
     }
     lines = _table(report).splitlines()
     assert [line.split()[0] for line in lines] == ["steps", *"11", *"55", "20", "20"]
     assert lines[4].endswith("5 steps: nothing was read so many steps later")
     assert "20 steps: nothing to predict from; expected rows whose state" in lines[6]
+    *rest, last = _table(report | {"starts": "filtered"}).splitlines()
+    assert rest == lines
+    assert last == "no reading was whole: predicted from all readings until then"

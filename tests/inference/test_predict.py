@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from boomdp_jax.core.history import make_history
-from boomdp_jax.inference.predict import _levels, predict, usable_starts
+from boomdp_jax.inference.predict import _levels, predict
+from boomdp_jax.inference.prediction_starts import usable_starts
 from boomdp_jax.physics import empty_params
 from tests.inference.posteriors import draws_like, make_posterior, room_spec, table_spec
 

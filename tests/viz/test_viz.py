@@ -1,5 +1,6 @@
 """Pictures are made without a display and show what they should."""
 
+import dataclasses
 import subprocess
 import sys
 
@@ -145,6 +146,20 @@ def test_a_prediction_lies_on_unpushed_motion(ax):
     np.testing.assert_allclose(
         lines["held-out readings"].get_ydata(), reading[:, 0, 2], atol=1e-6
     )
+
+
+def test_a_prediction_of_a_camera_starts_from_all_poses_until_then(ax):
+    history, reading = drifting_history()
+    unread = history.state_mask.at[..., 3:].set(False)
+    camera = dataclasses.replace(history, state_mask=unread, next_state_mask=unread)
+    draw_prediction(ax, free_posterior(), camera)
+    lines = {line.get_label(): line for line in ax.lines}
+    median = lines["predicted, median"].get_ydata()
+    # From the second row on, with 1 mrad of noise of both and no more readings: 14 mrad
+    # after 0.4 s are 0.5 sd.
+    first = len(reading) - 1 - len(median)
+    assert first == 1
+    np.testing.assert_allclose(median, reading[2:, 0, 2], atol=0.03)
 
 
 def test_a_prediction_needs_a_reading_and_room_for_it(ax):
