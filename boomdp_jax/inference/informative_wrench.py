@@ -8,9 +8,15 @@ $$I(u) = E\left[\log p(y \mid \Phi, u) - \log p(y \mid u)\right]
 
 over posterior draws: in expectation a lower bound, and never above log N. Foster et al.
 (2020), A unified stochastic gradient approach to designing Bayesian-optimal
-experiments, eq. 9. Of that, what y tells of the structure alone is
-$E[\log p(y \mid k, u) - \log p(y \mid u)]$, with $p(y \mid k, u)$ the mean over the
-draws of structure k. Noise is the same for every wrench, so that gains compare well.
+experiments, eq. 9. Noise is the same for every wrench, so that gains compare well.
+
+Of that, what y tells of the structure k alone is $E[\log q(k \mid y, u) - \log p(k)]$
+at least, for any probabilities q that were not made from the same y (Barber and Agakov
+2003, The IM algorithm). Here they are the shares of k among the other draws, weighted
+by their likelihoods: the own draw would tell its structure wherever readings tell draws
+apart at all. Few draws near a reading count as so many, beside one of the prior; and
+where readings tell draws apart so well that none is near, likelihoods raised to smaller
+powers have more of them: the power that tells most is taken.
 
 Readings err as the posterior says they do, normally or by Student's t, and the motion
 has the noise of its own that was inferred: what impulses drown, no push tells
@@ -30,22 +36,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import logsumexp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from boomdp_jax.core.arrays import Key
+from boomdp_jax.core.arrays import FloatScalar, Key
 from boomdp_jax.core.checked_input import real_array, whole_number
 from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.posterior_report import on_host
 from boomdp_jax.inference.reading_law import (
     draw_noise,
     law_after,
     log_likelihood,
     readings_of,
 )
+from boomdp_jax.inference.structure_report import group_by_structure
 from boomdp_jax.physics.actuator import delayed, past_commands
 from boomdp_jax.physics.arguments import check_state_is_finite, checked_state
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.state import State
+
+# Powers of likelihoods, by which more draws are near a reading.
+_POWERS = (1.0, 0.25, 0.0625, 0.015625)
 
 
 class InformationGain(NamedTuple):
@@ -58,7 +69,7 @@ class InformationGain(NamedTuple):
     gain: Float[Array, " candidate"]
     """Of structure and all numbers."""
     structure_gain: Float[Array, " candidate"]
-    """Of the structure alone; at most its entropy."""
+    """Of the structure alone, in expectation a lower bound; at most its entropy."""
     error: Float[Array, " candidate"]
     """Standard error of `gain`, for draws as given; differences err by less."""
 
@@ -133,14 +144,14 @@ def informative_wrench(
 
 
 def _structures(posterior: Posterior) -> np.ndarray:
-    """Number of each draw's structure, `[draw]`."""
-    num = posterior.num_draws
-    columns = [np.zeros((num, 1), bool)]
-    for kind, is_inferred in posterior.inferred.items():
-        active = np.asarray(getattr(posterior.params, kind).active).reshape(num, -1)
-        columns.append(active[:, np.ravel(is_inferred)])
-    rows = np.concatenate(columns, axis=1)
-    return np.unique(rows, axis=0, return_inverse=True)[1].reshape(num)
+    """Number of each draw's structure, whichever slots it is in, `[draw]`."""
+    number = np.zeros(posterior.num_draws, np.int32)
+    groups = group_by_structure(
+        on_host(posterior.params), posterior.inferred, posterior.weights
+    )
+    for index, group in enumerate(groups):
+        number[group.draws] = index
+    return number
 
 
 def _impulse_scale(posterior: Posterior, bodies: np.ndarray) -> Array | None:
@@ -198,10 +209,29 @@ def _gains(
         density = log_likelihood(law, readings_of(law, noise))
         own = jnp.diagonal(density)
         whole = logsumexp(density, axis=1) - jnp.log(num)
-        within = logsumexp(jnp.where(same, density, -jnp.inf), axis=1)
-        within = within - jnp.log(jnp.sum(same, axis=1))
         each = own - whole
         error = jnp.std(each) / jnp.sqrt(num)
-        return jnp.mean(each), jnp.mean(within - whole), error
+        return jnp.mean(each), _structure_gain(density, same), error
 
     return jax.lax.map(one, candidates)
+
+
+def _structure_gain(
+    density: Float[Array, "reading draw"], same: Bool[Array, "reading draw"]
+) -> FloatScalar:
+    """What readings tell of the structure, by the draws other than their own."""
+    num = density.shape[0]
+    if num < 2:
+        return jnp.zeros((), density.dtype)
+    others = jnp.where(jnp.eye(num, dtype=bool), -jnp.inf, density)
+    prior = (jnp.sum(same, axis=1) - 1.0) / (num - 1.0)
+    is_alone = prior <= 0
+
+    def gain(power: float) -> FloatScalar:
+        weight = jax.nn.softmax(power * others, axis=1)
+        size = 1.0 / jnp.sum(weight**2, axis=1)
+        told = (size * jnp.sum(weight * same, axis=1) + prior) / (size + 1.0)
+        each = jnp.log(told / jnp.where(is_alone, 1.0, prior))
+        return jnp.mean(jnp.where(is_alone, 0.0, each))
+
+    return jnp.maximum(jnp.max(jnp.stack([gain(p) for p in _POWERS])), 0.0)

@@ -19,12 +19,15 @@ from boomdp_jax.core.versions import library_versions
 from boomdp_jax.inference.body_numbers import inferred_numbers
 from boomdp_jax.inference.contact_numbers import report_collisions
 from boomdp_jax.inference.identity_record import as_record
+from boomdp_jax.inference.likeliest import ranking
 from boomdp_jax.inference.posterior_file import (
     read_posterior_file,
     write_posterior_file,
 )
 from boomdp_jax.inference.posterior_report import (
     SCHEMA,
+    doubled,
+    on_host,
     report_bodies,
     report_known,
     report_noise,
@@ -119,7 +122,7 @@ class Posterior(eqx.Module):
     def structure_probabilities(self) -> dict[str, float]:
         """Probability of each structure by its readable name, most probable first."""
         return structure_probabilities(
-            self.spec, _on_host(self.params), self.weights, self.inferred
+            self.spec, on_host(self.params), self.weights, self.inferred
         )
 
     def to_json(self) -> dict:
@@ -131,7 +134,7 @@ class Posterior(eqx.Module):
         of contact is inferred, `mass_ratios` where bodies can collide. What is not
         finite is None.
         """
-        params, prior = _on_host(self.params), _on_host(self.prior_params)
+        params, prior = on_host(self.params), on_host(self.prior_params)
         weights = self.weights
         report = {
             "schema": SCHEMA,
@@ -154,8 +157,8 @@ class Posterior(eqx.Module):
                 np.asarray(self.noise_scale, np.float64),
                 weights,
                 np.asarray(self.prior_noise_scale, np.float64),
-                _double(self.impulse_scale),
-                _double(self.prior_impulse_scale),
+                doubled(self.impulse_scale),
+                doubled(self.prior_impulse_scale),
             ),
             "log_evidence": float(self.log_evidence),
             "diagnostics": {"ok": True, "reasons": [], **self.diagnostics},
@@ -170,6 +173,11 @@ class Posterior(eqx.Module):
         return format_report(
             self.to_json(), self.structure_probabilities(), self.num_draws
         )
+
+    def ranking(self) -> Float[Array, " draw"]:
+        """Largest for the draw to take if it has to be one; see `likeliest.ranking`."""
+        weights = jax.nn.softmax(self.log_weight)
+        return ranking(self.params, self.inferred, weights, self.log_density)
 
     def sample_indices(self, key: Key, num_samples: int) -> Int[Array, " sample"]:
         """Draw places in the list of draws, by weight and independently.
@@ -384,17 +392,3 @@ def load_posterior(path: str | os.PathLike) -> Posterior:
         if name.startswith("inferred.")
     }
     return Posterior(params=params, prior_params=prior_params, spec=spec, **fields)
-
-
-def _double(array: Array | None) -> np.ndarray | None:
-    return None if array is None else np.asarray(array, np.float64)
-
-
-def _on_host(params: Params) -> Params:
-    """Params as NumPy arrays, floats in double precision."""
-
-    def convert(leaf: Array) -> np.ndarray:
-        array = np.asarray(leaf)
-        return array.astype(np.float64) if array.dtype.kind == "f" else array
-
-    return jax.tree.map(convert, params)

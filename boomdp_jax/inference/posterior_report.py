@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import jax
 import numpy as np
+from jaxtyping import Array
 
 from boomdp_jax.inference.prior import LOGARITHMIC
 from boomdp_jax.inference.structure_report import (
@@ -199,3 +200,18 @@ def _has_spread(entry: dict) -> bool:
         np.ravel(item["sd"]) for item in entry.values() if isinstance(item, dict)
     ]
     return any(sd is not None and sd > 0 for each in spreads for sd in each)
+
+
+def doubled(array: Array | None) -> np.ndarray | None:
+    """On the host in double precision."""
+    return None if array is None else np.asarray(array, np.float64)
+
+
+def on_host(params: Params) -> Params:
+    """Params as NumPy arrays, floats in double precision."""
+
+    def convert(leaf: Array) -> np.ndarray:
+        array = np.asarray(leaf)
+        return array.astype(np.float64) if array.dtype.kind == "f" else array
+
+    return jax.tree.map(convert, params)

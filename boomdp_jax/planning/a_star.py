@@ -156,7 +156,9 @@ def a_star(
         table_size,
         max_probes,
     )
-    return _search(key, as_belief(belief), state, frontier, max_plan_length)
+    return _search(
+        key, as_belief(belief, is_ranked=True), state, frontier, max_plan_length
+    )
 
 
 @eqx.filter_jit

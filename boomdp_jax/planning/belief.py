@@ -25,6 +25,9 @@ class Belief(eqx.Module):
     """What the model takes as its hypothesis, with a leading axis `hypothesis`."""
     log_weight: Float[Array, " hypothesis"]
     """Not necessarily normalised; −∞ for what is ruled out."""
+    log_density: Float[Array, " hypothesis"] | None = None
+    """By which one is the most probable, where weights do not tell: draws of a sampler
+    all weigh the same. None: by `log_weight`."""
 
     @property
     def num_hypotheses(self) -> int:
@@ -36,17 +39,28 @@ class Belief(eqx.Module):
         """Normalised to a sum of one."""
         return jax.nn.softmax(self.log_weight)
 
+    @property
+    def likeliest(self) -> IntScalar:
+        """Index of the most probable hypothesis."""
+        if self.log_density is None:
+            return jnp.argmax(self.log_weight)
+        return jnp.argmax(
+            jnp.where(self.log_weight > -jnp.inf, self.log_density, -jnp.inf)
+        )
+
     def __getitem__(self, index: Any) -> PyTree:
         """The hypothesis at an index, or those at several."""
         return jax.tree.map(lambda leaf: leaf[index], self.hypotheses)
 
 
-def as_belief(belief: Any) -> Belief:
+def as_belief(belief: Any, *, is_ranked: bool = False) -> Belief:
     """Read a belief in any of its forms.
 
     Args:
         belief: a `Belief`, a pair `(hypotheses, log_weight)`, or an object with
             `params` and `log_weight`.
+        is_ranked: whether such an object is asked which of its draws is the most
+            probable one, by its method `ranking`, where it has one.
 
     Returns:
         The same as a `Belief`.
@@ -56,10 +70,14 @@ def as_belief(belief: Any) -> Belief:
         ValueError: no hypothesis, another number of hypotheses than of weights, or
             log-weights of which none is finite, or one NaN or +∞.
     """
+    log_density = None
     if isinstance(belief, Belief):
         hypotheses, log_weight = belief.hypotheses, belief.log_weight
+        log_density = belief.log_density
     elif hasattr(belief, "params") and hasattr(belief, "log_weight"):
         hypotheses, log_weight = belief.params, belief.log_weight
+        if is_ranked and hasattr(belief, "ranking"):
+            log_density = jnp.asarray(belief.ranking(), float)
     elif isinstance(belief, tuple) and len(belief) == 2:
         hypotheses, log_weight = belief
     else:
@@ -81,7 +99,7 @@ def as_belief(belief: Any) -> Belief:
                 f"belief: leaf {name} has shape {jnp.shape(leaf)}; expected a leading "
                 f"axis of {log_weight.shape[0]} hypotheses, as many as weights"
             )
-    return Belief(jax.tree.map(jnp.asarray, hypotheses), log_weight)
+    return Belief(jax.tree.map(jnp.asarray, hypotheses), log_weight, log_density)
 
 
 def _check_weights(log_weight: Float[Array, " hypothesis"]) -> None:
@@ -126,7 +144,8 @@ def resample(key: Key, belief: Belief, num: int) -> Belief:
     if belief.num_hypotheses <= num:
         return belief
     index = systematic(key, belief.weight, num)
-    return Belief(belief[index], jnp.zeros(num))
+    density = None if belief.log_density is None else belief.log_density[index]
+    return Belief(belief[index], jnp.zeros(num), density)
 
 
 def systematic(
@@ -139,22 +158,37 @@ def systematic(
 
 
 def most_probable(belief: Belief) -> Belief:
-    """Only the hypothesis of the largest weight."""
-    return certain(belief[jnp.argmax(belief.log_weight)])
+    """Only the most probable hypothesis."""
+    return certain(belief[belief.likeliest])
 
 
 @full_precision
 def mean_hypothesis(belief: Belief) -> Belief:
-    """Weighted means of all numbers; what is not a float, of the most probable one."""
+    """Weighted means of all numbers, of those like the most probable hypothesis.
+
+    Like it are those that agree in all that is not a float, as in which constraints
+    exist: the same number means something else where they do not. Angles are averaged
+    as numbers.
+    """
+    best = belief[belief.likeliest]
+    weight = belief.weight
+    for leaf, value in zip(
+        *map(jax.tree.leaves, (belief.hypotheses, best)), strict=True
+    ):
+        if not jnp.issubdtype(leaf.dtype, jnp.inexact):
+            is_like = jnp.all(jnp.reshape(leaf == value[None], (len(leaf), -1)), axis=1)
+            weight = jnp.where(is_like, weight, 0.0)
+    weight = weight / weight.sum()
 
     def mean(leaf, best):
         if not jnp.issubdtype(leaf.dtype, jnp.inexact):
             return best
-        return jnp.tensordot(belief.weight.astype(leaf.dtype), leaf, axes=1)
+        counts = jnp.reshape(weight > 0, (-1, *[1] * best.ndim))
+        # Infinite where there is no limit, also in hypotheses that do not count.
+        known = jnp.where(counts, leaf, 0.0)
+        return jnp.tensordot(weight.astype(leaf.dtype), known, axes=1)
 
-    return certain(
-        jax.tree.map(mean, belief.hypotheses, belief[jnp.argmax(belief.log_weight)])
-    )
+    return certain(jax.tree.map(mean, belief.hypotheses, best))
 
 
 def draw_index(key: Key, belief: Belief) -> IntScalar:

@@ -227,7 +227,7 @@ def _read(belief: Belief, growth: Growth, trees: LazyTree) -> Plan:
     is_solved, is_exact = _verdict(lower, upper)
     index = jnp.argmax(lower + upper)
     q_values = 0.5 * (lower + upper)
-    likeliest = jnp.argmax(belief.log_weight)
+    likeliest = belief.likeliest
     tree = jax.tree.map(lambda leaf: leaf[likeliest], trees)
     problem = growth.problem
     width = problem.num_actions * growth.num_samples

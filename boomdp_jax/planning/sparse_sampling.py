@@ -113,8 +113,10 @@ def sparse_sampling(
         leaf_fn: `(hypothesis, state) -> value` at the horizon; none: 0.
         hypotheses: `"root"`: hypotheses are drawn once and each kept down its own tree
             (posterior sampling); `"fresh"`: drawn anew at every transition of one tree;
-            `"map"`: the most probable one; `"mean"`: mean parameters; `"adaptive"`: as
-            `"root"`, for one who will learn from the first action's outcome.
+            `"map"`: the most probable one (of a posterior the densest draw of its
+            likeliest structure); `"mean"`: mean parameters of those that agree with it
+            in all but numbers; `"adaptive"`: as `"root"`, for one who will learn from
+            the first action's outcome.
         num_hypotheses: how many are drawn for `"root"` and `"adaptive"`; a belief of no
             more is used whole, with its weights.
         likelihood_fn: `(hypothesis, state, action, next_state) -> log-density` of what
@@ -190,7 +192,7 @@ def sparse_sampling(
     sequence = None if previous is None else previous.sequence
     return _search(
         key,
-        as_belief(belief),
+        as_belief(belief, is_ranked=hypotheses in ("map", "mean")),
         state,
         problem,
         options,
@@ -358,7 +360,7 @@ def _sequence(
     problem: Problem, tree: Tree, roots: Belief, index: Array, options: Options
 ) -> PyTree:
     """Actions under the likeliest hypothesis."""
-    best = jnp.argmax(roots.log_weight)
+    best = roots.likeliest
     likeliest = jax.tree.map(lambda leaf: leaf[best], tree)
     if options.hypotheses != "adaptive":
         return problem.action(best_sequence(likeliest, index))

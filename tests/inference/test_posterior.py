@@ -10,6 +10,7 @@ import pytest
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.random_motion import add_reading_noise
 from boomdp_jax.physics import State, empty_params
+from boomdp_jax.physics.scene_spec import scene_spec_from_dict
 from tests.inference.posteriors import (
     draws_like,
     make_posterior,
@@ -262,3 +263,24 @@ def test_a_transition_takes_integers_and_numpy_without_a_warning(dtype):
         assert found.pose.dtype == jnp.float32
         # A fiftieth of a second at one metre a second.
         np.testing.assert_allclose(found.pose, 0.02, atol=0.05)
+
+
+@pytest.mark.parametrize("wrap", [lambda f: f, jax.jit])
+def test_the_draw_to_take_is_the_densest_of_the_likeliest_structure(wrap):
+    """A quarter has a wheel, which draw 0 does, and so has the densest one of all."""
+    density = jnp.linspace(-1.0, 1.0, 80).at[4].set(7.0).at[6].set(5.0)
+    posterior = table_posterior(80, log_density=density)
+    ranking = np.asarray(wrap(lambda p: p.ranking())(posterior))
+    has_wheel = np.arange(80) % 4 == 0
+    assert np.argmax(ranking) == 6
+    np.testing.assert_array_equal(ranking > -np.inf, ~has_wheel)
+    np.testing.assert_allclose(ranking[~has_wheel], density[~has_wheel])
+
+
+def test_one_structure_may_be_in_several_slots():
+    spec = scene_spec_from_dict(table_spec().to_dict() | {"unknown": {"revolute": 2}})
+    active = np.arange(10)[:, None] % 2 == np.array([0, 1])
+    active[:4] = False
+    params = draws_like(empty_params(1, num_revolute=2), 10, revolute_active=active)
+    posterior = make_posterior(spec, params, params)
+    np.testing.assert_array_equal(posterior.ranking() > -np.inf, np.arange(10) >= 4)
