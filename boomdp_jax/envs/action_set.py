@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -22,7 +24,27 @@ class ActionSet(eqx.Module):
         return self.wrench.shape[0]
 
     def __getitem__(self, action: IntScalar | int) -> Float[Array, "body 3"]:
-        """The wrench that an action stands for."""
+        """The wrench that an action stands for.
+
+        While JAX traces, an index out of range is that of the nearest one in it.
+
+        Raises:
+            TypeError: no whole number.
+            ValueError: not one of the actions.
+        """
+        if isinstance(action, jax.core.Tracer):
+            return self.wrench[jnp.clip(action, 0, self.num_actions - 1)]
+        index = np.asarray(action)
+        if index.dtype.kind not in "iu" or index.ndim:
+            raise TypeError(
+                f"action: expected a whole number below {self.num_actions}, got "
+                f"{action!r}"
+            )
+        if not 0 <= index < self.num_actions:
+            raise ValueError(
+                f"action: expected a number from 0 to {self.num_actions - 1}, got "
+                f"{int(index)}"
+            )
         return self.wrench[action]
 
 

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
+import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.inference.online import OnlineBelief
@@ -106,11 +107,17 @@ def _regression(
         return BodyRegression(
             subject.spec.scene,
             make(subject),
-            frame="world" if subject.is_bob else frame,
+            frame=_frame(subject, frame),
             angles=not subject.is_bob,
         )
 
     return build
+
+
+def _frame(subject: Subject, usual: str) -> str:
+    """The world's where directions in it count: of a bob, and of what may fall."""
+    falls = np.any(np.asarray(subject.spec.scene.gravity) != 0.0)
+    return "world" if subject.is_bob or falls else usual
 
 
 def _linear(subject: Subject) -> LinearRegression:
@@ -127,7 +134,7 @@ def _object_oriented(subject: Subject) -> AbstractModel:
         scene,
         radius=TOUCH_RADIUS,
         surroundings=surroundings,
-        frame="world" if subject.is_bob else "body",
+        frame=_frame(subject, "body"),
         angles=not subject.is_bob,
     )
 

@@ -80,6 +80,8 @@ class LoadedRun(NamedTuple):
     compile. NaN where `decision` counts it in."""
     world: str | None = None
     """What was true instead of what agents are told."""
+    noise: tuple[float, ...] | None = None
+    """Standard deviation of readings [m, rad, m/s, rad/s]; None: they are exact."""
 
     @property
     def setting(self) -> str:
@@ -163,6 +165,7 @@ def load_run(folder: str | os.PathLike) -> LoadedRun:
         decision=float(np.median(planning[planning > 0])),
         learning=float(np.median(learning)) if learning else float("nan"),
         world=content.get("world"),
+        noise=tuple(content["noise"]) if any(content.get("noise") or ()) else None,
     )
 
 
@@ -180,6 +183,11 @@ def check_comparable(runs: Sequence[LoadedRun]) -> None:
             raise ValueError(
                 f"{run.folder}: expected {theirs[0]} of {theirs[1]} steps as in "
                 f"{first.folder}, got {ours[0]} of {ours[1]}"
+            )
+        if run.noise != first.noise:
+            raise ValueError(
+                f"{run.folder}: noise: expected {first.noise} as in {first.folder}, "
+                f"got {run.noise}"
             )
 
 

@@ -1,5 +1,7 @@
 """Sets of wrenches to choose from."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -16,6 +18,32 @@ def test_forces_divide_the_circle():
     np.testing.assert_allclose(turn[1:] / turn[:-1], np.exp(2j * np.pi / 6))
     np.testing.assert_array_equal(wrench[6:, 1], [[0, 0, 0.5], [0, 0, -0.5], [0, 0, 0]])
     np.testing.assert_array_equal(actions[7], wrench[7])
+
+
+@pytest.mark.usefixtures("no_type_checks")
+@pytest.mark.parametrize(
+    ("action", "error", "got"),
+    [
+        (-1, ValueError, "-1"),
+        (4, ValueError, "4"),
+        (np.int32(99), ValueError, "99"),
+        (jnp.asarray(7), ValueError, "7"),
+        (float("nan"), TypeError, "nan"),
+        (1.0, TypeError, "1.0"),
+        (True, TypeError, "True"),
+        (np.array([0, 1]), TypeError, r"array\(\[0, 1\]\)"),
+    ],
+)
+def test_what_is_no_action_is_refused(action, error, got):
+    actions = forces_round_circle(1, 0, 1.0, 3)
+    with pytest.raises(error, match=f"^action: expected a .*, got {got}$"):
+        _ = actions[action]
+
+
+def test_traced_actions_out_of_range_are_the_nearest():
+    actions = forces_round_circle(1, 0, 1.0, 3)
+    found = jax.jit(jax.vmap(lambda index: actions[index]))(jnp.array([-1, 1, 4]))
+    np.testing.assert_array_equal(found, actions.wrench[jnp.array([0, 1, 3])])
 
 
 def test_sets_are_joined_in_order():

@@ -40,6 +40,7 @@ def test_gripper_and_links_are_where_complex_numbers_put_them():
         assert abs(complex(*bodies[2, :2]) - (elbow + tip) / 2) < 1e-12
 
 
+@pytest.mark.slow
 def test_derivative_of_gripper_is_that_of_finite_differences():
     cases, step = draws(1), 1e-6
     slopes = jax.jit(jax.vmap(jax.jacfwd(ROBOT.gripper)))(cases)

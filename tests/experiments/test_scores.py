@@ -132,6 +132,11 @@ def test_runs_that_differ_are_not_put_side_by_side(folders, tmp_path):
     noisy = write_run(tmp_path / "noisy", "true", [[-1.0, 0, 0, 0]], noise=NOISE)
     with pytest.raises(ValueError, match=r"expected cart of 4 steps.*got cart, noisy"):
         check_comparable([loaded, load_run(noisy)])
+    louder = write_run(
+        tmp_path / "louder", "true", [[-1.0, 0, 0, 0]], noise=[2 * n for n in NOISE]
+    )
+    with pytest.raises(ValueError, match=r"louder: noise: expected \(.*noisy, got \("):
+        check_comparable([load_run(noisy), load_run(louder)])
     short = write_run(tmp_path / "short", "true", [[-1.0, 0.0]])
     with pytest.raises(ValueError, match=r"expected cart of 4 steps.*got cart of 2"):
         check_comparable([loaded, load_run(short)])
