@@ -1,5 +1,6 @@
 """From a history to a posterior over Φ and over which constraints exist."""
 
+from boomdp_jax.inference.end_stops import without_stops as without_stops
 from boomdp_jax.inference.fitted_kernel import structure_kernel as structure_kernel
 from boomdp_jax.inference.identifiability import Identifiability as Identifiability
 from boomdp_jax.inference.identifiability import identifiability as identifiability
@@ -74,4 +75,5 @@ __all__ = [
     "predict",
     "run_nuts",
     "structure_kernel",
+    "without_stops",
 ]

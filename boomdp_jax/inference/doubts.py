@@ -5,6 +5,7 @@ import numpy as np
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.angle_sense import angle_sense_reasons
 from boomdp_jax.inference.drag_doubts import drag_reasons
+from boomdp_jax.inference.end_stops import end_stop_reasons
 from boomdp_jax.inference.known_joints import known_joint_reasons
 from boomdp_jax.inference.lever_doubts import lever_reasons
 from boomdp_jax.inference.noise_doubts import noise_reasons
@@ -49,6 +50,7 @@ def with_doubts(
         *velocity_reasons(spec, history),
         *angle_sense_reasons(spec, history),
         *known_joint_reasons(spec, history),
+        *end_stop_reasons(spec, history, posterior),
         *noise_reasons(spec, history, *noise),
         *lever_reasons(spec, posterior),
         *angle_reasons(spec, history, posterior),

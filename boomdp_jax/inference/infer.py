@@ -1,8 +1,9 @@
 """From scenes and histories to posteriors: the one call that most users need."""
 
 import dataclasses
+import functools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
@@ -18,6 +19,7 @@ from boomdp_jax.inference.assemble import assemble_posterior
 from boomdp_jax.inference.batch_blocks import blocks_of_batch
 from boomdp_jax.inference.block import stack_blocks
 from boomdp_jax.inference.doubts import with_doubts, with_notes
+from boomdp_jax.inference.end_stops import without_stops
 from boomdp_jax.inference.evidence_report import BlockResult
 from boomdp_jax.inference.fixed_structure import Structure, check_structure
 from boomdp_jax.inference.likelihoods import ChosenLikelihood, choose_likelihood
@@ -36,6 +38,10 @@ from boomdp_jax.physics.scene_spec import SceneSpec
 
 METHODS = ("auto", "rj", "enumerate", "smc", "nuts", "svi", "laplace", "map")
 """Ways to infer: `auto` is `rj`."""
+
+# Rows between stops, at least, to be inferred from alone; and what parts the random
+# numbers of that from those before.
+_FEWEST_FREE, _STOPS_KEY = 20, 0x5709
 
 OUTLIERS = {"none": None, "student-t": DEGREES_OF_FREEDOM}
 """Degrees of freedom of the noise of readings; None: it is normal."""
@@ -58,6 +64,10 @@ def infer(
     mesh: Mesh | None = None,
 ) -> Posterior:
     """Posterior over densities, joints, wheels, friction, noise, and which exist.
+
+    Hypotheses know no ends of a way. Where a drawer or a door seems to come against
+    one, rows in which it may have done so are left out, and a note says how many (not
+    with `nuts` and `svi`, which only doubt it).
 
     Args:
         key: random key.
@@ -218,16 +228,17 @@ def infer_batch(
                 )
                 posteriors.append(with_notes(found, missing[index]))
         else:
-            method = "rj" if method == "auto" else method
-            posteriors = _infer_structures(
-                key,
-                specs,
-                histories,
-                settings,
-                method=method,
+            run_structures = functools.partial(
+                _infer_structures,
+                settings=settings,
+                method="rj" if method == "auto" else method,
                 progress=progress,
                 freedom=OUTLIERS[outliers],
                 likelihood=chosen,
+            )
+            posteriors = run_structures(key, specs, histories)
+            histories = _again_without_stops(
+                run_structures, key, specs, histories, posteriors
             )
     entries = chosen.diagnostics
     if outliers != "none":
@@ -277,6 +288,38 @@ def checked_options(
     return counts, choose_likelihood(
         likelihood, horizon, method=method, outliers=outliers
     )
+
+
+def _again_without_stops(
+    run_structures: Callable[..., list[Posterior]],
+    key: Key,
+    specs: Sequence[SceneSpec],
+    histories: Sequence[History],
+    posteriors: list[Posterior],
+) -> list[History]:
+    """Put posteriors of what comes against stops right, in place.
+
+    Returns:
+        The rows that were inferred from.
+    """
+    kept, again = list(histories), []
+    for index, posterior in enumerate(posteriors):
+        free, notes = without_stops(posterior, histories[index])
+        if notes and free.num_transitions >= _FEWEST_FREE:
+            kept[index] = free
+            again.append((index, notes))
+    if again:
+        found = run_structures(
+            jax.random.fold_in(key, _STOPS_KEY),
+            [specs[index] for index, _ in again],
+            [kept[index] for index, _ in again],
+        )
+        for (index, notes), posterior in zip(again, found, strict=True):
+            before = posteriors[index].seconds
+            seconds = {name: before[name] + s for name, s in posterior.seconds.items()}
+            posterior = dataclasses.replace(posterior, seconds=seconds)
+            posteriors[index] = with_notes(posterior, notes)
+    return kept
 
 
 def _infer_structures(

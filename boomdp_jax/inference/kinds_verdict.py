@@ -9,6 +9,7 @@ import numpy as np
 from boomdp_jax.core.arrays import on_device
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.angle_sense import angle_sense_reasons
+from boomdp_jax.inference.end_stops import end_stop_reasons
 from boomdp_jax.inference.kind_objects import ObjectsAlone
 from boomdp_jax.inference.kinds_file import LearntKinds
 from boomdp_jax.inference.outliers import outlier_notes
@@ -142,6 +143,7 @@ def with_kind_doubts(
         *run_break_reasons(spec, used),
         *velocity_reasons(spec, used),
         *angle_sense_reasons(spec, used),
+        *end_stop_reasons(spec, used, posterior),
         *angle_reasons(spec, used, posterior),
         *stance_reasons(spec, posterior),
     ]

@@ -186,7 +186,8 @@ def _late_line(late: list[tuple[Steps, "_Late"]]) -> str:
     poses = " and ".join(part.what for part, _ in late)
     return (
         f"{twists} look like differences of {poses} over the step that ends there, or "
-        f"rows are few steps of a simulator (they fit about {before:.2g} ms earlier); "
+        "delayed or filtered, or rows are few steps of a simulator (they fit about "
+        f"{before:.2g} ms earlier); "
         "expected velocities measured at the reading's instant, and ten steps of a "
         "simulator or more a row: leave velocities out (NaN)"
     )

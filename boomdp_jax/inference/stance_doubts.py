@@ -37,6 +37,7 @@ def stance_reasons(spec: SceneSpec, posterior: Posterior) -> list[str]:
             reasons.append(
                 f"{body.name}: has a wheel beside friction with the floor with "
                 f"probability {probability:.2f}; what stands on three legs or a rim "
-                "looks like that: expected 'feet' in the scene, got none"
+                "looks like that, and so do several wheels that slip: expected 'feet' "
+                "in the scene, got none"
             )
     return reasons

@@ -1,0 +1,201 @@
+"""Drawers and doors of MuJoCo's that come against stops, and such that do not."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from boomdp_jax.core.history import History, make_history
+from boomdp_jax.inference.end_stops import end_stop_reasons, without_stops
+from boomdp_jax.inference.infer import infer
+from boomdp_jax.physics import empty_params, scene_spec_from_dict
+from tests.inference.posteriors import draws_like, make_posterior
+
+DT, NUM_ROWS, ROWS_OF_RUN, ROWS_OF_PUSH = 0.05, 100, 25, 8
+HALF, MASS = (0.25, 0.15), 4.0
+AXIS, PIN = np.array([0.8, 0.6]), (-0.25, 0.15)
+NOISE = np.array([1e-3, 1e-3, 5e-3, 5e-3, 5e-3, 0.02])
+JOINTS = {
+    "drawer": f'type="slide" axis="{AXIS[0]} {AXIS[1]} 0"',
+    "door": f'type="hinge" axis="0 0 1" pos="{PIN[0]} {PIN[1]} 0"',
+}
+SHAPE = {"type": "box", "half_extents": list(HALF)}
+SPEC = scene_spec_from_dict(
+    {
+        "schema": "planar-scene-1",
+        "dt": DT,
+        "bodies": [{"name": "it", "shape": SHAPE}],
+        "unknown": {"revolute": 1, "prismatic": 1, "weld": 1, "ground": 1},
+    }
+)
+
+
+def recording(
+    kind: str, seed: int, *, end: float | None, poses_only: bool = False, **law: float
+) -> History:
+    """A thing pushed at random in four runs, from rest between its ends."""
+    limit = "" if end is None else f'limited="true" range="{-end} {end}"'
+    more = " ".join(f'{name}="{value}"' for name, value in law.items())
+    model: Any = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><compiler angle="radian"/><option timestep="0.0005" gravity="0 0 0"
+        integrator="implicitfast"/><worldbody><body name="it">
+        <joint {JOINTS[kind]} {limit} solreflimit="0.004 1" {more}/>
+        <geom type="box" size="{HALF[0]} {HALF[1]} 0.1" mass="{MASS}"/>
+        </body></worldbody></mujoco>"""
+    )
+    data: Any = mujoco.MjData(model)
+    rng = np.random.default_rng([seed, 9])
+    num = -(-NUM_ROWS // ROWS_OF_PUSH)
+    push = rng.normal(0.0, (4.0, 4.0, 0.3), (num, 3))
+    wrench = np.repeat(push, ROWS_OF_PUSH, axis=0)[:NUM_ROWS, None]
+
+    def read():
+        mujoco.mj_forward(model, data)
+        twist = np.zeros(6)
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, 1, twist, 0)
+        turn = data.xmat[1]
+        angle = np.arctan2(turn[3], turn[0])
+        return np.array([*data.xpos[1][:2], angle, *twist[3:5], twist[2]])
+
+    state, next_state = np.zeros((2, NUM_ROWS, 1, 6))
+    for row in range(NUM_ROWS):
+        if row % ROWS_OF_RUN == 0:
+            mujoco.mj_resetData(model, data)
+            data.qpos[0] = 0.0 if end is None else 0.5 * rng.uniform(-end, end)
+            reading = read() + NOISE * rng.standard_normal(6)
+        state[row, 0] = reading
+        data.xfrc_applied[1, [0, 1, 5]] = wrench[row, 0]
+        mujoco.mj_step(model, data, round(DT / model.opt.timestep))
+        reading = read() + NOISE * rng.standard_normal(6)
+        next_state[row, 0] = reading
+    state[..., 2] = _continued(state[..., 2], next_state[..., 2])
+    if poses_only:
+        state[..., 3:] = next_state[..., 3:] = np.nan
+    episode = np.arange(NUM_ROWS) // ROWS_OF_RUN
+    return make_history(state, wrench, next_state, DT, episode=episode)
+
+
+def _continued(angle, next_angle):
+    """Angles without jumps, in place of the second; doors turn by over half a turn."""
+    for row in range(len(angle)):
+        if row % ROWS_OF_RUN:
+            angle[row] = next_angle[row - 1]
+        step = next_angle[row] - angle[row]
+        next_angle[row] -= 2 * np.pi * np.round(step / (2 * np.pi))
+    return angle
+
+
+def posterior_of(kind: str):
+    """One that is sure of the pin of a door."""
+    slots = {"num_revolute": 1, "num_prismatic": 1, "num_weld": 1, "num_ground": 1}
+    params = draws_like(empty_params(1, density=20.0, **slots), 4)
+    if kind == "door":
+        pin = params.revolute
+        pin = eqx.tree_at(
+            lambda p: (p.active, p.anchor_a),
+            pin,
+            (jnp.ones_like(pin.active), jnp.broadcast_to(jnp.array(PIN), (4, 1, 2))),
+        )
+        params = eqx.tree_at(lambda p: p.revolute, params, pin)
+    inferred = {
+        name: np.ones(getattr(params, name).active.shape[1:], bool)
+        for name in ("revolute", "distance", "prismatic", "weld", "wheel", "ground")
+        if getattr(params, name) is not None
+    }
+    return make_posterior(SPEC, params, params, inferred=inferred)
+
+
+def reasons(kind: str, history: History) -> list[str]:
+    return end_stop_reasons(SPEC, history, posterior_of(kind))
+
+
+@pytest.mark.parametrize("poses_only", [False, True])
+@pytest.mark.parametrize(("kind", "end"), [("drawer", 0.1), ("door", 0.3)])
+def test_what_comes_against_its_ends_is_named(kind, end, poses_only):
+    name = {"drawer": "the line that it goes along", "door": "its turn about its pin"}
+    found = [
+        reasons(kind, recording(kind, seed, end=end, poses_only=poses_only))
+        for seed in range(6)
+    ]
+    told = [each[0] for each in found if each]
+    assert len(told) >= 5
+    ways = set(name.values()) if kind == "door" else {name[kind]}
+    for line in told:
+        assert line.startswith("it: is held back at the ends of ")
+        assert any(way in line for way in ways)
+
+
+@pytest.mark.parametrize("poses_only", [False, True])
+@pytest.mark.parametrize("kind", ["drawer", "door"])
+@pytest.mark.parametrize("law", [{}, {"frictionloss": 0.5}, {"damping": 3.0}])
+def test_what_turns_back_because_it_is_pushed_is_not(kind, law, poses_only):
+    for seed in range(4):
+        history = recording(kind, seed, end=None, poses_only=poses_only, **law)
+        assert reasons(kind, history) == []
+
+
+def test_friction_that_holds_anywhere_is_no_stop():
+    for seed in range(4):
+        history = recording("door", seed, end=None, frictionloss=1.5)
+        assert reasons("door", history) == []
+
+
+def test_a_reading_that_is_far_off_is_no_stop():
+    history = recording("drawer", 0, end=None, poses_only=True)
+    span = float(jnp.ptp(history.next_state[:, 0, 0]))
+    far = history.next_state.at[40, 0, :2].add(2.0 * span * jnp.asarray(AXIS))
+    far = far.at[60, 0, :2].add(-2.0 * span * jnp.asarray(AXIS))
+    state = history.state.at[41].set(far[40]).at[61].set(far[60])
+    history = dataclasses.replace(history, state=state, next_state=far)
+    assert reasons("drawer", history) == []
+
+
+def test_rows_at_the_ends_are_left_out():
+    history = recording("drawer", 1, end=0.1)
+    free, notes = without_stops(posterior_of("drawer"), history)
+    num = int(free.num_transitions)
+    assert notes == [
+        f"it: {NUM_ROWS - num} of {NUM_ROWS} rows are left out, in which it may have "
+        "come against a stop at the ends of the line that it goes along"
+    ]
+    assert free.capacity == NUM_ROWS
+    assert 40 < num < 90
+    # Three sd of noise, and a fiftieth of the way, from either end.
+    along = np.asarray(free.state)[:num, 0, :2] @ AXIS
+    assert np.abs(along).max() < 0.1 + 2e-3
+    place = np.asarray(history.state)[:, 0, :2] @ AXIS
+    is_inside = np.abs(place) < 0.07
+    assert num > 0.6 * is_inside.sum()
+    # A run begins wherever a row does not go on from the one before.
+    known = {tuple(row): i for i, row in enumerate(np.asarray(history.state)[:, 0])}
+    rows = np.array([known[tuple(row)] for row in np.asarray(free.state)[:num, 0]])
+    goes_on = (np.diff(rows) == 1) & (rows[1:] % ROWS_OF_RUN != 0)
+    same = np.diff(np.asarray(free.episode)[:num]) == 0
+    np.testing.assert_array_equal(goes_on, same)
+
+
+def test_nothing_is_left_out_where_nothing_is_held_back():
+    history = recording("drawer", 1, end=None)
+    free, notes = without_stops(posterior_of("drawer"), history)
+    assert free is history
+    assert notes == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "poses_only"), [(1, False), (5, True)])
+def test_a_drawer_with_stops_is_weighed_between_them(seed, poses_only):
+    """With all rows its 4 kg were 11.1 (8.1 to 15.4), and 45 (7.5 to 137)."""
+    history = recording("drawer", seed, end=0.1, poses_only=poses_only)
+    posterior = infer(jax.random.key(seed), SPEC, history)
+    assert posterior.diagnostics["ok"], posterior.diagnostics["reasons"]
+    notes = posterior.diagnostics["notes"]
+    assert any("rows are left out, in which it may have come" in note for note in notes)
+    assert posterior.structure_probabilities()["slide"] > 0.95
+    mass = posterior.to_json()["bodies"]["it"]["mass"]
+    assert mass["q50"] == pytest.approx(MASS, rel=0.06)
+    assert abs(mass["q50"] - MASS) < 3.0 * mass["sd"]
