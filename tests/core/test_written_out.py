@@ -83,6 +83,7 @@ def total(f):
     return of_floats
 
 
+@pytest.mark.slow
 def test_derivatives(numbers, close):
     feet, pin = numbers
     arguments = (feet["place"], feet["load"], feet["is_on"], pin)

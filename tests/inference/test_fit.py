@@ -228,6 +228,7 @@ def test_climb_reaches_the_maximum_that_scipy_finds(box):
         assert found.value[i] >= -best.fun - 1e-2
 
 
+@pytest.mark.slow
 def test_noise_is_found(box):
     truth = np.log(MASS / AREA / 30.0) / 1.5
     best = make_fits(box, np.arange(2), np.zeros(2, int), np.full((2, 1), truth))

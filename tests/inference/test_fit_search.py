@@ -31,6 +31,7 @@ def search(targets, fits, num_searches: int):
     return search_further(rng, targets, Guesses.of(targets), fits, settings, lack)
 
 
+@pytest.mark.slow
 def test_copies_of_one_climb_do_not_agree(few):
     targets, fits = few
     found = search(targets, join_fits(fits, fits, fits), 1)

@@ -156,6 +156,7 @@ def joint_scores(move, num_chains: int = 6000, num_rounds: int = 12) -> np.ndarr
     return values.mean(axis=1) / (values.std(axis=1) / np.sqrt(num_chains))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("move", [jump, change, walk, leap])
 def test_joint_distribution_is_kept(move):
     scores = joint_scores(move)

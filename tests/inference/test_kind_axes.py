@@ -21,6 +21,7 @@ DT, NUM_ROWS = 0.05, 40
 NOISE = np.array([1e-3, 1e-3, 1e-3, 4e-3, 4e-3, 4e-3])
 
 
+@pytest.mark.slow
 def test_a_drawer_is_the_same_whatever_its_axis_is_measured_from():
     block = make_block(scene(unknown=UNKNOWN), (0,), recorded("drawer"))
     layout = block.layout

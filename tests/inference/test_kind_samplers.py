@@ -117,6 +117,7 @@ def sampled(request):
     return data, run_kind_chains(np.random.default_rng(1), data, settings)
 
 
+@pytest.mark.slow
 def test_partitions_have_their_exact_probabilities(sampled):
     _, draws = sampled
     exact = exact_partitions()
@@ -351,6 +352,7 @@ def log_known_and_read(known: np.ndarray, reading: float) -> float:
     return float(np.logaddexp.reduce(each))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("concentration", [CONCENTRATION, 0.0])
 def test_an_object_is_recognised_among_kinds_known_before(concentration):
     reading, num_chains = 0.1, 64

@@ -152,6 +152,7 @@ def test_conditional_of_a_slot_is_joint_over_marginal(precision):
     assert worst < precision.choose(single=2e-5, double=1e-11)
 
 
+@pytest.mark.slow
 def test_conditional_weighs_components_by_what_is_kept():
     target = make_target(NoLikelihood())
     mixture = random_mixture(target, num_each=3)

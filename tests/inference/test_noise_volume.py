@@ -77,6 +77,7 @@ def problem(request):
     return targets, fits, (middle, filtered), NoiseFit.of_vector(vector)
 
 
+@pytest.mark.slow
 def test_volumes_are_those_of_a_filter_for_each_noise(problem):
     targets, fits, track, noise = problem
     champion, precision = fits.z[0], fits.precision[0]

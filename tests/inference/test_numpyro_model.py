@@ -139,6 +139,7 @@ def test_prior_draws_follow_the_stated_distributions(prior):
         assert passes(prior[f"noise.{group}"][:, 0] ** 2, variance)
 
 
+@pytest.mark.slow
 def test_pins_are_where_the_readings_have_their_anchors(spec, prior):
     history = pushed(spec)
     poses = np.concatenate([history.state, history.next_state])[:, 0, :3]

@@ -38,6 +38,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_belief_comes_back_to_the_bit(written: Path):
     online = OnlineBelief(SCENE, **SIZES)
     found = online.load(written)

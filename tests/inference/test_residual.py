@@ -53,6 +53,7 @@ def test_a_law_that_is_added_is_named_with_its_coefficient(name):
     assert_names(found, name, expected)
 
 
+@pytest.mark.slow
 def test_a_free_box_follows_no_further_law():
     """Twenty of them, whose noise is known: a bound of 1 in 2,000 for each."""
     rng = np.random.default_rng(2)
@@ -214,6 +215,7 @@ def test_what_goes_on_from_reading_to_reading_is_a_doubt(
     assert len(notes) == is_note
 
 
+@pytest.mark.slow
 def test_checks_tell_how_readings_hang_together():
     """Of a free box next to nothing; of one that is pulled on unseen, much."""
     rng = np.random.default_rng(17)

@@ -53,6 +53,7 @@ def rod(second: str, place: np.ndarray, length: float) -> dict:
     return {"type": "distance", "a": "box", "b": second, "length": length, **ends}
 
 
+@pytest.mark.slow
 def test_a_rod_to_the_world_is_found_beside_a_wheel():
     box = {"name": "box", "pose": POSE.tolist(), **BOX}
     unknown = {"distance": 1, "wheel": 1}
@@ -74,6 +75,7 @@ def test_a_rod_to_the_world_is_found_beside_a_wheel():
         np.testing.assert_allclose(found.length[index, 0], LENGTH, atol=0.06)
 
 
+@pytest.mark.slow
 def test_a_rod_between_bodies_is_found():
     other = {"name": "other", "pose": [0.9, 0.6, -0.4], "density": 30.0, **BOX}
     cos, sin = np.cos(-0.4), np.sin(-0.4)

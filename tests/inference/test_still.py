@@ -123,6 +123,7 @@ def test_a_few_rows_are_too_few_to_say_so():
     assert still_notes(box_scene(), few) == []
 
 
+@pytest.mark.slow
 def test_what_is_let_be_is_left_out():
     """Whose readings tell where it is, and nothing of what it is."""
     assert bodies_let_be(OPEN, recorded(), None) == (0,)

@@ -351,6 +351,7 @@ def test_dual_averaging_finds_the_step_of_a_known_response():
     np.testing.assert_allclose(state.step_size(False), np.log(2.0), rtol=0.02)
 
 
+@pytest.mark.slow
 def test_diagnostics_pass_good_chains_and_name_bad_ones():
     target, mixture, *_ = linear_case()
     draws, info = run_chains(jax.random.key(0), target, mixture, **RUN)

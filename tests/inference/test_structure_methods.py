@@ -114,6 +114,7 @@ def test_draws_follow_the_posterior(method):
         assert np.all(z[structure == k][:, ~in_use(k)] == 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", WITH_ERRORS)
 def test_good_modes_give_a_good_verdict(method):
     for verdict in drawn(method).diagnostics:

@@ -129,6 +129,7 @@ def test_what_a_push_does_to_a_fast_pin_is_as_by_a_fine_rule():
     assert max(off) > 4e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "rate", [9.0, *(pytest.param(r, marks=pytest.mark.slow) for r in (4.5, 12.0))]
 )

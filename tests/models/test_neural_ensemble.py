@@ -30,6 +30,7 @@ def members_of(regressor, fit, inputs):
     )(regressor.prepare(fit))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "is_probabilistic", [True, pytest.param(False, marks=pytest.mark.slow)]
 )

@@ -87,6 +87,7 @@ def test_a_pin_is_found_if_it_may_be_there():
     np.testing.assert_allclose(params.revolute.anchor_a[0], [0.45, 0.0], atol=0.02)
 
 
+@pytest.mark.slow
 def test_nothing_is_missed_at_the_truth():
     model = PointFit(cart().scene, SMALL, capacity=12)
     truth = cart().params()

@@ -32,6 +32,7 @@ def test_sliding_box_stops_after_its_stopping_distance(precision):
     assert abs(trajectory.pose[-1, 0, 0] - speed**2 / (2 * slowing)) < 2e-3
 
 
+@pytest.mark.slow
 def test_stopping_distance_converges_as_the_step_shrinks():
     friction, speed = 0.3, 1.5
     distance = speed**2 / (2 * friction * 9.81)
@@ -110,6 +111,7 @@ def test_slow_pushes_do_not_reveal_mass_beyond_the_friction_limit():
     np.testing.assert_allclose(displacements, steady, atol=1.1 * transient)
 
 
+@pytest.mark.slow
 def test_slow_pushes_obey_the_quasi_static_limit_surface():
     world = on_ground(0.4, 1e6)
     generator = np.random.default_rng(1)

@@ -121,6 +121,7 @@ def test_bodies_that_meet_are_what_they_are_alone():
     np.testing.assert_allclose(together, expected, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_what_contact_brings_is_not_taken_away():
     """A link at rest on a pin is kicked by a disc: all in contact are one island."""
     link = box("link", 15.35, 0.2, 0.0) | {"contact": DISC["contact"]}

@@ -148,6 +148,7 @@ def test_a_hinge_stops_at_its_limits():
     assert float(states.pose[-1, 0, 2]) == pytest.approx(0.5, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_welded_boxes_move_as_one_body():
     bodies = [box("a", (-0.2, 0.0, 0.0)), box("b", (0.2, 0.0, 0.0))]
     weld = tie("weld", "a", "b", (0.2, 0.0), (-0.2, 0.0))

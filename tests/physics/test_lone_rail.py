@@ -128,6 +128,7 @@ def test_a_weld_holds_its_pose_to_the_bit_whatever_was_read(paths):
     )
 
 
+@pytest.mark.slow
 def test_a_drawer_reads_only_what_lies_along_its_line(paths):
     params, state, wrench = cases("prismatic")
     across = jnp.array([-jnp.sin(AXIS), jnp.cos(AXIS)])

@@ -102,6 +102,7 @@ def expected(cases):
     return {has_ground: short(*each) for has_ground, each in cases.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("has_ground", [False, True], ids=["wheel", "wheel and feet"])
 def test_a_long_step_leads_about_where_short_ones_do(cases, expected, has_ground):
     # Five whole iterations of Newton's method leave one of 150 unsolved, most of which

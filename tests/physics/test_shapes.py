@@ -120,6 +120,7 @@ OUTLINES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OUTLINES)
 def test_feet_of_an_outline_rub_as_all_of_it_does(name: str):
     """Friction of an even pressure, integrated, in every ratio of spin to speed."""

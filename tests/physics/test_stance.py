@@ -65,6 +65,7 @@ def run(spec, params):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "is_pair",
     [False, pytest.param(True, marks=pytest.mark.slow)],
@@ -96,6 +97,7 @@ def test_a_diagonal_that_carries_all_is_two_legs(is_told):
     np.testing.assert_allclose(run(spec, params), run(two, two.params()), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_half_of_the_load_on_a_diagonal_changes_nothing():
     spec = world(BOXES["polygon"][0])
     params = with_stance(

@@ -78,6 +78,7 @@ def whole_tree(world, state, key=KEY, is_shared=True, **options):
     return recursive_values(key, problem, world, state, DEPTH, NUM_SAMPLES, is_shared)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_shared", [True, False])
 def test_decision_and_value_are_the_whole_trees(is_shared):
     num_expansions = []

@@ -20,6 +20,7 @@ def leaf():
     return learned_leaf(KEY, jnp.asarray(states), jnp.asarray(values))
 
 
+@pytest.mark.slow
 def test_values_of_other_states_are_those_of_riccati(leaf):
     states = np.random.default_rng(2).uniform(-1.5, 1.5, (100, 2))
     expected = np.array([worlds.riccati(state, HORIZON)[0] for state in states])

@@ -44,6 +44,7 @@ def test_edges_join_neighbours_and_meet_where_nodes_merged(levels):
     assert len(levels[-1].edge) == 0
 
 
+@pytest.mark.slow
 def test_values_and_the_chosen_branch_are_those_of_the_best_walk(levels):
     # By hand: three steps to 3, then stay: −2, −1, 0, 0, 0, 0.
     assert levels[0].value[0] == pytest.approx(-3.0)
