@@ -102,7 +102,8 @@ def begin_namo(
     Args:
         agent: one of `CHARACTERS`.
         folder: made if there is none.
-        num_seeds: rooms; their seeds are 0, 1, ...
+        num_seeds: rooms; their seeds are 0, 1, ... A run may be begun again with more
+            of them.
         room: `random` or `story`.
         num_things: in a random room.
         difficulty: of a random room.
@@ -144,9 +145,13 @@ def begin_namo(
     path = run.folder / "run.json"
     if path.exists():
         # Runs of older versions do not name a delay; there was none.
-        check_same(path, {"delay": 0, **read_json(path, SCHEMA)}, content)
-    else:
-        write_json(path, content)
+        begun = {"delay": 0, **read_json(path, SCHEMA)}
+        # Rooms do not depend on how many there are: more of them go on.
+        more = {**begun, "num_seeds": max(num_seeds, begun.get("num_seeds", 0))}
+        check_same(path, more, content)
+        if begun == content:
+            return run
+    write_json(path, content)
     return run
 
 

@@ -95,9 +95,16 @@ def test_the_command_line_writes_rooms_and_goes_on(tmp_path, capsys):
         capsys.readouterr().err
     )
     assert not (tmp_path / "curves.png").exists()
+    # More rooms are added, and none is taken away.
+    assert main([*arguments, "3"]) == 0
+    assert "0 of 3 rooms solved" in capsys.readouterr().out
+    assert (tmp_path / "seed-00000.npz").stat().st_mtime_ns == before
+    assert read_npz(tmp_path / "results.npz")["is_solved"].tolist() == [False] * 3
+    assert main([*arguments, "2"]) == 2
+    assert "num_seeds: expected 3" in capsys.readouterr().err
     # Another run in the same folder is refused.
-    assert main([*arguments, "3"]) == 2
-    assert "num_seeds: expected 2" in capsys.readouterr().err
+    assert main([*arguments, "3", "--difficulty", "0"]) == 2
+    assert "difficulty: expected 0.5" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
