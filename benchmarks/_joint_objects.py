@@ -54,6 +54,8 @@ class JointObject(NamedTuple):
     """Friction loss [N m] or [N]."""
     handle: np.ndarray
     """In the frame of the body [m]."""
+    stop: float = np.inf
+    """How far it goes either way [m] or [rad]."""
 
     @property
     def size(self) -> float:
@@ -72,8 +74,16 @@ def rotate(angle: float, vector: np.ndarray) -> np.ndarray:
     return np.array([[cos, -sin], [sin, cos]]) @ vector
 
 
-def random_object(rng: np.random.Generator, kind: str) -> JointObject:
-    """Draw an object: sides of 0.2 to 1 m, density of 5 to 100 kg/m²."""
+def random_object(
+    rng: np.random.Generator, kind: str, *, has_stops: bool = False
+) -> JointObject:
+    """Draw an object: sides of 0.2 to 1 m, density of 5 to 100 kg/m².
+
+    Args:
+        rng: source of randomness.
+        kind: one of `KINDS`.
+        has_stops: whether it goes 0.05 to 0.25 m, or rad, either way.
+    """
     half = rng.uniform(0.1, 0.5, 2)
     mass = float(np.exp(rng.uniform(np.log(5.0), np.log(100.0)))) * 4.0 * half.prod()
     hinge = rng.uniform(-0.95, 0.95, 2) * half
@@ -95,6 +105,7 @@ def random_object(rng: np.random.Generator, kind: str) -> JointObject:
         damping=float(rate * (inertia if is_door else mass)),
         loss=float(share * mass * STANDARD_GRAVITY * arm),
         handle=0.9 * far,
+        stop=float(rng.uniform(0.05, 0.25)) if has_stops else np.inf,
     )
 
 
@@ -119,13 +130,15 @@ def scene_of(thing: JointObject) -> SceneSpec:
 def handled(rng: np.random.Generator, thing: JointObject) -> History:
     """Handle an object a few times, and read it with noise.
 
-    Each interaction starts at rest, somewhere along what the joint leaves free. A force
+    Each interaction starts at rest, somewhere along what the joint leaves free (with
+    stops, within 0.8 of the way to them). A force
     at the handle rises and falls twice, in a random direction and back; it is given as
     the wrench at the centre of mass that it amounts to as a row begins, held over the
     row. Forces are such that the handle moves at 0.2 m/s, root mean square; a fixed
     thing is pushed with 5 to 100 N.
     """
     starts = rng.uniform(-0.5, 0.5, NUM_INTERACTIONS)
+    starts *= min(1.0, 1.6 * thing.stop)
     directions = rng.uniform(-np.pi, np.pi, NUM_INTERACTIONS)
     strengths = rng.uniform(0.6, 1.0, NUM_INTERACTIONS)
     time = DT * (np.arange(NUM_ROWS) + 0.5)
@@ -208,6 +221,10 @@ def _world_text(thing: JointObject, tick: float) -> str:
     x, y, angle = thing.pose
     inertia = thing.mass * (thing.half**2).sum() / 3.0
     friction = f'damping="{thing.damping}" frictionloss="{thing.loss}"'
+    if np.isfinite(thing.stop):
+        # Of four ticks' time, and without a bounce.
+        friction += f' range="{-thing.stop} {thing.stop}" limited="true"'
+        friction += f' solreflimit="{4 * tick} 1"'
     local = thing.axis - angle
     joint = {
         "door": f'<joint type="hinge" axis="0 0 1" {friction} '
