@@ -30,7 +30,7 @@ _LAGS = (1, 2, 4)
 # of the way.
 _NOISES, _SHARE = 3.0, 0.02
 # Windows needed away from the ends, and at them.
-_FEWEST_INNER, _FEWEST_AT_END = 20, 3
+_FEWEST_INNER, _FEWEST_AT_END = 25, 3
 # In units of what is left elsewhere: what counts as held back, the most that one window
 # counts, and what the mean of all at the ends has to be in its standard errors.
 _HELD, _MOST, _LEAST = 5.0, 8.0, 8.0
@@ -39,9 +39,8 @@ _HELD, _MOST, _LEAST = 5.0, 8.0, 8.0
 _TIMES = 4.0
 # Once will do if it is so much, and nothing like it is anywhere else.
 _ONCE = 15.0
-# Readings within so many times their noise are of a thing at rest, and this share of
-# such is much of the time.
-_STILL, _RESTS = 6.0, 0.2
+# Readings within so many times their noise are of a thing at rest.
+_STILL = 6.0
 _ROUNDS = 30
 _MEDIAN = 0.6745
 
@@ -53,6 +52,8 @@ class _Windows(NamedTuple):
     reasons: Float[np.ndarray, "window number"]
     give: Float[np.ndarray, " window"]
     """By how much a unit of dry friction may change the speed either way."""
+    is_still: Bool[np.ndarray, " window"]
+    """Whether it rests there."""
     is_high: Bool[np.ndarray, " window"]
     is_low: Bool[np.ndarray, " window"]
     least: float
@@ -153,27 +154,25 @@ def _stopped_ways(
 
 def _is_stopped(way: Way) -> bool:
     """Whether it is held back at an end, by some of the ways to look at it."""
-    if not np.isfinite(way.place).any() or _rests(way):
+    if not np.isfinite(way.place).any():
         return False
     by_speed = [_speed_windows(way)] if np.isfinite(way.speed).mean() > 0.5 else []
     by_place = [_place_windows(way, lag) for lag in _LAGS]
     return any(_tells_a_stop(windows) for windows in (*by_speed, *by_place))
 
 
-def _rests(way: Way) -> bool:
-    """Whether it does so away from the ends, much of the time.
-
-    Then friction holds it back, as far as it can, and nothing can be told.
-    """
+def _still(way: Way) -> Bool[np.ndarray, " reading"]:
+    """Readings about which it rests, over a few before and after in the same run."""
     known = np.flatnonzero(np.isfinite(way.place))
     run, q = way.run[known], way.place[known]
-    middle = np.arange(_LAGS[-1], len(known) - _LAGS[-1])
-    middle = middle[run[middle - _LAGS[-1]] == run[middle + _LAGS[-1]]]
-    inside = q[middle[:, None] + np.arange(-_LAGS[-1], _LAGS[-1] + 1)]
-    is_high, is_low = _ends(way, inside.min(axis=1), inside.max(axis=1))
-    is_still = np.ptp(inside, axis=1) < _STILL * way.noise
-    is_inner = ~(is_high | is_low)
-    return bool(is_still[is_inner].mean() > _RESTS) if is_inner.any() else False
+    out = np.zeros(len(way.place), bool)
+    for each in np.unique(run):
+        mine = np.flatnonzero(run == each)
+        for i in mine:
+            near = q[max(i - _LAGS[-1], mine[0]) : min(i + _LAGS[-1], mine[-1]) + 1]
+            is_told = len(near) > _LAGS[-1]
+            out[known[i]] = is_told and np.ptp(near) < _STILL * way.noise
+    return out
 
 
 def _ends(way: Way, least: np.ndarray, most: np.ndarray) -> tuple:
@@ -219,6 +218,7 @@ def _place_windows(way: Way, lag: int) -> _Windows:
         pushes,
         0.5 * (came + goes),
         0.5 * (before + after),
+        _still(way)[b],
         (is_high, is_low),
         0.5 * np.sqrt(6.0) * way.noise / step,
         lag,
@@ -238,30 +238,38 @@ def _speed_windows(way: Way) -> _Windows:
         np.min([q[a], q[b], ahead], axis=0, initial=np.inf),
         np.max([q[a], q[b], ahead], axis=0, initial=-np.inf),
     )
-    return _windows(
-        v[b] - v[a], whole[b] - whole[a], 0.5 * (v[a] + v[b]), length, ends, 0.0, 1
-    )
+    is_still = _still(way)
+    is_still = is_still[a] & is_still[b]
+    speed = 0.5 * (v[a] + v[b])
+    pushes = whole[b] - whole[a]
+    return _windows(v[b] - v[a], pushes, speed, length, is_still, ends, 0.0, 1)
 
 
-def _windows(change, pushes, speed, length, ends, least, overlap) -> _Windows:
+def _windows(change, pushes, speed, length, is_still, ends, least, overlap) -> _Windows:
     """Add to pushes what speeds bring about."""
     drag = np.column_stack([speed * length, np.sign(speed) * length])
     reasons = np.column_stack([pushes, drag])
-    return _Windows(change, reasons, length, *ends, least, overlap)
+    return _Windows(change, reasons, length, is_still, *ends, least, overlap)
 
 
 def _tells_a_stop(windows: _Windows) -> bool:
     """Whether windows at the ends are held back, and others are not."""
-    is_inner = ~(windows.is_high | windows.is_low)
+    is_between = ~(windows.is_high | windows.is_low)
     is_end = windows.is_high ^ windows.is_low
+    is_inner = is_between & ~windows.is_still
     if is_inner.sum() < _FEWEST_INNER or is_end.sum() < _FEWEST_AT_END:
         return False
     found = _fit(windows.reasons[is_inner], windows.change[is_inner])
     left = windows.change - windows.reasons @ found
     spread = np.median(np.abs(left[is_inner])) / _MEDIAN
     spread = max(spread, windows.least, np.finfo(float).tiny)
-    # Dry friction may hold by as much as it drags, whichever way that is.
-    free = np.maximum(np.abs(left) - 2.0 * np.abs(found[-1]) * windows.give, 0.0)
+    # Friction may hold whichever way it is pushed, by as much as it drags, and by as
+    # much as it is pushed where it rests between the ends.
+    rests = is_between & windows.is_still
+    holds = np.abs(windows.reasons[:, :-2] @ found[:-2]) / windows.give
+    hold = max(np.max(holds[rests], initial=0.0), np.abs(found[-1]))
+    free = np.abs(left) - (hold + np.abs(found[-1])) * windows.give
+    free = np.maximum(free, 0.0)
     inward = np.where(windows.is_high, -1.0, 1.0) * np.sign(left) * free / spread
     at_end, elsewhere = inward[is_end], np.abs(inward[is_inner])
     held, pushed = np.sum(at_end > _HELD), np.sum(at_end < -_HELD)
@@ -272,10 +280,12 @@ def _tells_a_stop(windows: _Windows) -> bool:
         and mean > _LEAST
     )
     # A reading that is far off looks so once, and pushed on before and after; friction
-    # takes no more away than it and pushes do elsewhere.
+    # takes no more away than it and pushes do elsewhere, but hardly shows where a thing
+    # mostly rests.
     most = np.abs(windows.change[is_inner]).max() / spread
     is_once = at_end.max() > max(_ONCE, most) and pushed == 0
-    is_once &= elsewhere.max() < _HELD and len(at_end) <= len(elsewhere)
+    is_once &= elsewhere.max() < _HELD
+    is_once &= max(len(at_end), rests.sum()) <= len(elsewhere)
     return bool(is_often or is_once)
 
 
