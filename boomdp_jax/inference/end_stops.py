@@ -33,7 +33,7 @@ _NOISES, _SHARE = 3.0, 0.02
 _FEWEST_INNER, _FEWEST_AT_END = 25, 3
 # In units of what is left elsewhere: what counts as held back, the most that one window
 # counts, and what the mean of all at the ends has to be in its standard errors.
-_HELD, _MOST, _LEAST = 5.0, 8.0, 8.0
+_HELD, _MOST, _LEAST = 5.0, 8.0, 7.0
 # Of so many windows held back, at most one may be pushed on, and the share of those far
 # off elsewhere is so many times less.
 _TIMES = 4.0
@@ -41,6 +41,8 @@ _TIMES = 4.0
 _ONCE = 15.0
 # Readings within so many times their noise are of a thing at rest.
 _STILL = 6.0
+# What varies by less than this share of the most is not told by a fit.
+_TOLD = 1e-6
 _ROUNDS = 30
 _MEDIAN = 0.6745
 
@@ -96,25 +98,62 @@ def without_stops(posterior: Posterior, history: History) -> tuple[History, list
         )
     if not notes:
         return history, []
-    kept = np.flatnonzero(is_free)
-    episode = np.asarray(history.episode)[kept]
-    begins = (np.diff(kept, prepend=-2) > 1) | (np.diff(episode, prepend=-1) != 0)
+    return _only(history, is_free, _reach(posterior)), notes
+
+
+def _reach(posterior: Posterior) -> float:
+    """How long ago a command may have been given that is in effect [s]."""
+    actuator = posterior.params.actuator
+    if actuator is None or actuator.delay is None:
+        return 0.0
+    return float(np.max(np.asarray(actuator.delay), initial=0.0))
+
+
+def _only(history: History, is_kept: np.ndarray, reach: float) -> History:
+    """Some rows, of which another episode begins after each gap.
+
+    Commands from before a gap may still be in effect after it: rows that are so near
+    come first, without their readings.
+    """
+    kept, mask = np.flatnonzero(is_kept), np.asarray(history.mask)
+    before, dt = np.asarray(history.episode), np.asarray(history.dt)
+    begins = (np.diff(kept, prepend=-2) > 1) | (np.diff(before[kept], prepend=-1) != 0)
+    rows, is_read, episode = [], [], []
+    for run in np.split(kept, np.flatnonzero(begins)[1:]) if len(kept) else []:
+        first = run[0]
+        while (
+            first > 0
+            and mask[first - 1]
+            and before[first - 1] == before[run[0]]
+            and dt[first : run[0]].sum() < reach
+        ):
+            first -= 1
+        num_unread = run[0] - first
+        rows += [*range(first, run[0]), *run]
+        is_read += [False] * num_unread + [True] * len(run)
+        episode += [len(episode) and episode[-1] + 1] * (num_unread + len(run))
+    index, told = np.array(rows, int), np.array(is_read, bool)
+    # What a row ends at is where the next one starts.
+    is_last_told = told | (np.append(told[1:], False))
     state, next_state = (
-        np.where(np.asarray(mask)[kept], np.asarray(values)[kept], np.nan)
-        for values, mask in (
-            (history.state, history.state_mask),
-            (history.next_state, history.next_state_mask),
+        np.where(
+            np.asarray(there)[index] & use[:, None, None],
+            np.asarray(values)[index],
+            np.nan,
+        )
+        for values, there, use in (
+            (history.state, history.state_mask, told),
+            (history.next_state, history.next_state_mask, is_last_told),
         )
     )
-    free = make_history(
+    return make_history(
         state,
-        np.asarray(history.action)[kept],
+        np.asarray(history.action)[index],
         next_state,
-        np.asarray(history.dt)[kept],
-        episode=np.cumsum(begins) - 1,
-        capacity=history.capacity,
+        dt[index],
+        episode=np.array(episode, int),
+        capacity=max(history.capacity, len(index)),
     )
-    return free, notes
 
 
 def end_stop_reasons(
@@ -257,19 +296,25 @@ def _tells_a_stop(windows: _Windows) -> bool:
     is_between = ~(windows.is_high | windows.is_low)
     is_end = windows.is_high ^ windows.is_low
     is_inner = is_between & ~windows.is_still
-    if is_inner.sum() < _FEWEST_INNER or is_end.sum() < _FEWEST_AT_END:
+    num, numbers = is_inner.sum(), windows.reasons.shape[1]
+    if num < max(_FEWEST_INNER, 2 * numbers) or is_end.sum() < _FEWEST_AT_END:
         return False
-    found = _fit(windows.reasons[is_inner], windows.change[is_inner])
-    left = windows.change - windows.reasons @ found
+    size = _sizes(windows.reasons[is_inner], windows.reasons)
+    reasons = windows.reasons / size
+    found = _fit(reasons[is_inner], windows.change[is_inner])
+    left = windows.change - reasons @ found
     spread = np.median(np.abs(left[is_inner])) / _MEDIAN
+    spread *= np.sqrt(num / (num - numbers))
     spread = max(spread, windows.least, np.finfo(float).tiny)
+    # Where pushes are unlike those elsewhere, less is known of what they do.
+    spread = spread * np.sqrt(1.0 + _variance(reasons[is_inner], reasons))
     # Friction may hold whichever way it is pushed, by as much as it drags, and by as
     # much as it is pushed where it rests between the ends.
+    drag = np.abs(found[-1] / size[-1])
     rests = is_between & windows.is_still
-    holds = np.abs(windows.reasons[:, :-2] @ found[:-2]) / windows.give
-    hold = max(np.max(holds[rests], initial=0.0), np.abs(found[-1]))
-    free = np.abs(left) - (hold + np.abs(found[-1])) * windows.give
-    free = np.maximum(free, 0.0)
+    holds = np.abs(reasons[:, :-2] @ found[:-2]) / windows.give
+    hold = max(np.max(holds[rests], initial=0.0), drag)
+    free = np.maximum(np.abs(left) - (hold + drag) * windows.give, 0.0)
     inward = np.where(windows.is_high, -1.0, 1.0) * np.sign(left) * free / spread
     at_end, elsewhere = inward[is_end], np.abs(inward[is_inner])
     held, pushed = np.sum(at_end > _HELD), np.sum(at_end < -_HELD)
@@ -282,23 +327,34 @@ def _tells_a_stop(windows: _Windows) -> bool:
     # A reading that is far off looks so once, and pushed on before and after; friction
     # takes no more away than it and pushes do elsewhere, but hardly shows where a thing
     # mostly rests.
-    most = np.abs(windows.change[is_inner]).max() / spread
+    most = np.max(np.abs(windows.change / spread)[is_inner])
     is_once = at_end.max() > max(_ONCE, most) and pushed == 0
     is_once &= elsewhere.max() < _HELD
     is_once &= max(len(at_end), rests.sum()) <= len(elsewhere)
     return bool(is_often or is_once)
 
 
+def _sizes(reasons: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Units of reasons in which what some windows tell next to nothing of is small."""
+    size = np.sqrt(np.mean(reasons**2, axis=0))
+    size = np.maximum(size, _TOLD * np.max(np.abs(others), axis=0, initial=0.0))
+    return np.where(size > 0.0, size, 1.0)
+
+
+def _variance(reasons: np.ndarray, others: np.ndarray) -> Float[np.ndarray, " other"]:
+    """Of what is fitted to some windows, at others, in units of one window's."""
+    _, values, directions = np.linalg.svd(reasons, full_matrices=False)
+    values = np.maximum(values, _TOLD * max(values.max(), 1.0))
+    return np.sum((others @ directions.T / values) ** 2, axis=1)
+
+
 def _fit(reasons: np.ndarray, change: np.ndarray) -> np.ndarray:
     """Coefficients by Huber's rule, of which what is far off says little."""
-    size = np.sqrt(np.mean(reasons**2, axis=0))
-    size = np.where(size > 0.0, size, 1.0)
-    unit = reasons / size
     root = np.ones(len(change))
-    found = np.zeros(unit.shape[1])
+    found = np.zeros(reasons.shape[1])
     for _ in range(_ROUNDS):
-        found = np.linalg.lstsq(unit * root[:, None], change * root, rcond=None)[0]
-        left = np.abs(change - unit @ found)
+        found = np.linalg.lstsq(reasons * root[:, None], change * root, rcond=_TOLD)[0]
+        left = np.abs(change - reasons @ found)
         spread = np.median(left) / _MEDIAN + np.finfo(float).tiny
         root = 1.0 / np.sqrt(np.maximum(left / spread, 1.0))
-    return found / size
+    return found

@@ -16,6 +16,9 @@ from boomdp_jax.physics.scene_spec import SceneSpec
 _ACROSS, _WIDTH = 3.0, 0.03
 _FEWEST = 20
 """Readings of a line."""
+# A reading is off if it is so many times as far from its neighbours as they are from
+# theirs, or as noise is.
+_ODD = 4.0
 # Probability of a pin from which the body is taken to turn about it.
 _LIKELY = 0.5
 
@@ -46,22 +49,30 @@ def find_ways(
         body: index of the body.
     """
     readings = readings_in_order(spec, history)
-    values, run = readings.values[:, body], readings.run
-    time, wrench = _after_each(history, body)
+    poses, run = readings.values, readings.run
+    values = poses[:, body]
+    time, wrench = _after_each(history)
+    # What it is tied to may be pushed in its stead.
+    others = [i for i in range(wrench.shape[1]) if i != body and not spec.is_static[i]]
     gravity = np.asarray(spec.scene.gravity, float)
     steady = np.ones((len(values), 1))
     ways = []
     line = _line(values, run)
     if line is not None:
         centre, along, noise = line
+        place = (values[:, :2] - centre) @ along
+        # What is pinned far away goes along a line as well, by torques too.
+        force = [wrench[:, body, :2] @ along, steady, wrench[:, body, 2]]
+        for other in others:
+            force += [wrench[:, other, :2] @ along, wrench[:, other, 2]]
         ways.append(
             Way(
-                (values[:, :2] - centre) @ along,
+                _without_odd(place, time, run, noise),
                 values[:, 3:5] @ along,
                 noise,
                 run,
                 time,
-                np.column_stack([wrench[:, :2] @ along, steady]),
+                _acting(force),
                 "the line that it goes along",
             )
         )
@@ -74,11 +85,25 @@ def find_ways(
             [cos * arm[0] - sin * arm[1], sin * arm[0] + cos * arm[1]]
         )
         lever = np.nan_to_num(lever)
-        torque = wrench[:, 2] + lever[:, 0] * wrench[:, 1] - lever[:, 1] * wrench[:, 0]
-        pull = lever * np.any(gravity != 0.0)
-        force = np.column_stack([torque, steady, pull])
+        force = [_torque(wrench[:, body], lever), steady]
+        if np.any(gravity != 0.0):
+            force += [lever]
+        pins = values[:, :2] - lever
+        pin = np.sum(np.nan_to_num(pins), axis=0) / max(
+            1, np.isfinite(pins[:, 0]).sum()
+        )
+        for other in others:
+            force += [_torque(wrench[:, other], poses[:, other, :2] - pin)]
         ways.append(
-            Way(angle, values[:, 5], noise, run, time, force, "its turn about its pin")
+            Way(
+                _without_odd(angle, time, run, noise),
+                values[:, 5],
+                noise,
+                run,
+                time,
+                _acting(force),
+                "its turn about its pin",
+            )
         )
     return ways
 
@@ -123,14 +148,59 @@ def end_of_each(history: History) -> Int[np.ndarray, " row"]:
     return np.arange(len(rows)) + np.cumsum(begins)
 
 
-def _after_each(history: History, body: int) -> tuple[np.ndarray, np.ndarray]:
-    """Time of each of `readings_in_order`, and the wrench from there to the next."""
+def _after_each(history: History) -> tuple[np.ndarray, np.ndarray]:
+    """Time of each of `readings_in_order`, and the wrenches from there to the next."""
     rows, end = np.flatnonzero(np.asarray(history.mask)), end_of_each(history)
     length = np.zeros(end[-1] + 1)
     length[end] = np.asarray(history.dt, float)[rows]
-    wrench = np.zeros((len(length), 3))
-    wrench[end - 1] = np.asarray(history.action, float)[rows, body]
+    wrench = np.zeros((len(length), history.num_bodies, 3))
+    wrench[end - 1] = np.asarray(history.action, float)[rows]
     return np.cumsum(length), wrench
+
+
+def _torque(wrench: np.ndarray, lever: np.ndarray) -> np.ndarray:
+    """About a pin that levers are from; as if there were none where they are NaN."""
+    turn = lever[:, 0] * wrench[:, 1] - lever[:, 1] * wrench[:, 0]
+    return wrench[:, 2] + np.nan_to_num(turn)
+
+
+def _acting(force: list[np.ndarray]) -> np.ndarray:
+    """Side by side, without what never acts."""
+    columns = np.column_stack(force)
+    return columns[:, np.any(columns != 0.0, axis=0)]
+
+
+def _without_odd(
+    place: np.ndarray, time: np.ndarray, run: np.ndarray, noise: float
+) -> np.ndarray:
+    """The same with NaN for a reading that is off while its neighbours are not.
+
+    What bounces is off the line of its neighbours too, but they are then off the lines
+    of those beside them.
+    """
+    known = np.flatnonzero(np.isfinite(place))
+    q, t, of = place[known], time[known], run[known]
+
+    def off(before: int, after: int) -> np.ndarray:
+        """How far each is from the line through two others; NaN: not in its run."""
+        out = np.full(len(q), np.nan)
+        i = np.arange(max(0, -before), len(q) - after)
+        a, c = i + before, i + after
+        share = (t[i] - t[a]) / (t[c] - t[a])
+        bend = q[i] - q[a] - share * (q[c] - q[a])
+        out[i] = np.where(of[a] == of[c], np.abs(bend), np.nan)
+        return out
+
+    own = off(-1, 1)
+    beside = np.full((2, len(q)), np.nan)
+    beside[0, 1:] = off(-1, 2)[:-1]
+    beside[1, :-1] = off(-2, 1)[1:]
+    most = np.max(np.where(np.isnan(beside), 0.0, beside), axis=0)
+    is_told = np.any(np.isfinite(beside), axis=0)
+    is_odd = is_told & (own > _ODD * np.maximum(most, noise))
+    out = place.copy()
+    out[known[is_odd]] = np.nan
+    return out
 
 
 def _unwrapped(angle: np.ndarray, run: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from boomdp_jax.core.history import History, make_history
 from boomdp_jax.inference.end_stops import end_stop_reasons, without_stops
 from boomdp_jax.inference.infer import infer
 from boomdp_jax.physics import empty_params, scene_spec_from_dict
+from boomdp_jax.physics.params import Actuator
 from tests.inference.posteriors import draws_like, make_posterior
 
 DT, NUM_ROWS, ROWS_OF_RUN, ROWS_OF_PUSH = 0.05, 100, 25, 8
@@ -145,14 +146,80 @@ def test_friction_that_holds_anywhere_is_no_stop():
         assert reasons("door", history) == []
 
 
-def test_a_reading_that_is_far_off_is_no_stop():
-    history = recording("drawer", 0, end=None, poses_only=True)
-    span = float(jnp.ptp(history.next_state[:, 0, 0]))
-    far = history.next_state.at[40, 0, :2].add(2.0 * span * jnp.asarray(AXIS))
-    far = far.at[60, 0, :2].add(-2.0 * span * jnp.asarray(AXIS))
-    state = history.state.at[41].set(far[40]).at[61].set(far[60])
-    history = dataclasses.replace(history, state=state, next_state=far)
+@pytest.mark.parametrize("poses_only", [False, True])
+@pytest.mark.parametrize("num", [1, 3, 5])
+def test_readings_that_are_far_off_are_no_stop(num, poses_only):
+    for seed in range(4):
+        history = recording("drawer", seed, end=None, poses_only=poses_only)
+        rng = np.random.default_rng(seed)
+        rows = 2 * rng.choice(np.arange(1, NUM_ROWS // 2 - 1), num, replace=False)
+        off = jnp.asarray(rng.choice([-0.5, 0.5], num)[:, None] * AXIS)
+        next_state = history.next_state.at[rows, 0, :2].add(off)
+        # The next row of the same run starts from the same reading.
+        goes_on = (rows + 1) % ROWS_OF_RUN != 0
+        state = history.state.at[rows[goes_on] + 1].set(next_state[rows[goes_on]])
+        history = dataclasses.replace(history, state=state, next_state=next_state)
+        assert reasons("drawer", history) == []
+
+
+def test_what_a_torque_swings_to_and_fro_comes_against_nothing():
+    """A pinned box over a small angle, its middle nearly on a line, in closed form."""
+    rng = np.random.default_rng(0)
+    inertia = MASS * ((HALF[0] ** 2 + HALF[1] ** 2) / 3.0 + np.dot(PIN, PIN))
+    # Begins and ends at rest, with as much torque one way as the other.
+    one = np.repeat([1.0, -1.0, -1.0, 1.0], 6)
+    torque = np.concatenate([rng.uniform(0.5, 1.5) * one for _ in range(6)])
+    rate = np.concatenate([[0.0], np.cumsum(torque * DT / inertia)])
+    angle = np.concatenate([[0.0], np.cumsum(DT * 0.5 * (rate[1:] + rate[:-1]))])
+    cos, sin = np.cos(angle), np.sin(angle)
+    x, y = -np.array(PIN)
+    arm = np.column_stack([cos * x - sin * y, sin * x + cos * y])
+    states = np.column_stack(
+        [arm + PIN, angle, -rate * arm[:, 1], rate * arm[:, 0], rate]
+    )
+    states = (states + NOISE * rng.standard_normal(states.shape))[:, None]
+    wrench = np.zeros((len(torque), 1, 3))
+    wrench[:, 0, 2] = torque
+    history = make_history(states[:-1], wrench, states[1:], DT)
+    assert reasons("door", history) == []
     assert reasons("drawer", history) == []
+
+
+def test_commands_that_are_still_in_effect_stay_in_the_table():
+    """Those of before a gap, as far back as the longest delay, their readings not."""
+    history, late = recording("drawer", 1, end=0.1), posterior_of("drawer")
+    delay = jnp.full((4, 1), 1.5 * DT)
+    actuator = Actuator(gain=None, bias=None, delay=delay)
+    params = eqx.tree_at(
+        lambda p: p.actuator, late.params, actuator, is_leaf=lambda leaf: leaf is None
+    )
+    late = eqx.tree_at(lambda p: p.params, late, params)
+    (now, _), (free, _) = (
+        without_stops(posterior, history)
+        for posterior in (posterior_of("drawer"), late)
+    )
+    action = np.asarray(history.action)[:, 0]
+    num_read = 0
+    for run in np.unique(np.asarray(free.episode)[np.asarray(free.mask)]):
+        rows = np.flatnonzero(np.asarray(free.mask) & (np.asarray(free.episode) == run))
+        is_read = np.asarray(free.next_state_mask)[rows, 0, 0]
+        # The last of those before it ends at the piece's first reading.
+        num_before = int(np.argmax(is_read)) + int(not is_read[0])
+        num_read += len(rows) - num_before
+        assert num_before <= 2
+        own = np.asarray(free.action)[rows, 0]
+        starts = [
+            i
+            for i in range(NUM_ROWS - len(rows) + 1)
+            if np.array_equal(action[i : i + len(rows)], own)
+        ]
+        assert starts
+        assert (
+            num_before == 2
+            or any(i % ROWS_OF_RUN == 0 for i in starts)
+            or (num_before == 1 and any(i % ROWS_OF_RUN == 1 for i in starts))
+        )
+    assert num_read >= int(now.num_transitions)
 
 
 def test_rows_at_the_ends_are_left_out():
