@@ -255,13 +255,14 @@ class _Block:
         change = change / self._dt[:, None, None]
         length = np.where(np.asarray(self._data.is_used) > 0, self._dt, 0.0)
         progress = (np.cumsum(length) - 0.5 * length) / np.sum(length) - 0.5
+        edges = _from_edges(np.asarray(self._data.is_start) > 0)
         paths = []
         for body in range(middle.shape[1]):
             own = spread[:, body]
             both = np.column_stack([np.hypot(own[:, 3], own[:, 4]), own[:, 5]])
             place = middle[:, body]
             applied = (self._wrench[:, body], change[:, body], ahead[:, body])
-            rest = (both, progress)
+            rest = (both, progress, *edges)
             paths.append(Path(place[:, :3], place[:, 3:], *applied, *rest))
         return paths
 
@@ -342,6 +343,14 @@ class _Block:
             found.append(each)
             correlated.append(both)
         return found, tuple(correlated)
+
+
+def _from_edges(is_start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Steps of the same run before each step, and after it, `[time]`."""
+    row = np.arange(len(is_start))
+    begin = np.maximum.accumulate(np.where(is_start, row, 0))
+    last = np.where(np.append(is_start[1:], True), row, len(row))
+    return row - begin, np.minimum.accumulate(last[::-1])[::-1] - row
 
 
 def _length(change: np.ndarray) -> np.ndarray:

@@ -26,6 +26,10 @@ class Path(NamedTuple):
     """How well velocity [m/s] and spin [rad/s] are known."""
     progress: Float[np.ndarray, " time"]
     """How far the recording has gone, from -1/2 to 1/2 of its length."""
+    since_begin: Float[np.ndarray, " time"]
+    """Steps of its run before each step."""
+    until_end: Float[np.ndarray, " time"]
+    """Steps of its run after each step."""
 
 
 class Law(NamedTuple):
@@ -119,6 +123,30 @@ def _own_axis_law(letter: str, number: int) -> tuple[Law, Law]:
             f"a further share of the applied force along its own {letter}",
             "",
             lambda p: [_along(_axis(p, number), _force_along(p, number))],
+        ),
+    )
+
+
+def _rows(number: int) -> str:
+    return "row" if number == 1 else f"{number} rows"
+
+
+def _edge_laws(num_rows: int) -> tuple[Law, Law]:
+    """Commands that do not act yet, or no longer, in some rows of each run."""
+    return (
+        Law(
+            f"begin_{num_rows}",
+            f"a further share of the applied wrench in the first {_rows(num_rows)} of "
+            "each run, as where it is recorded before it acts",
+            "",
+            lambda p: [p.wrench * (p.since_begin < num_rows)[:, None]],
+        ),
+        Law(
+            f"end_{num_rows}",
+            f"a further share of the applied wrench in the last {_rows(num_rows)} of "
+            "each run, as where it is recorded after it has ceased to act",
+            "",
+            lambda p: [p.wrench * (p.until_end < num_rows)[:, None]],
         ),
     )
 
@@ -234,5 +262,10 @@ LAWS: tuple[Law, ...] = (
         "N m",
         lambda p: [_torque(np.sin(p.pose[:, 2])), _torque(np.cos(p.pose[:, 2]))],
     ),
+    *_edge_laws(1),
+    *_edge_laws(2),
+    *_edge_laws(3),
+    *_edge_laws(5),
+    *_edge_laws(8),
 )
 """Candidates, the same for every body."""

@@ -82,3 +82,18 @@ def test_a_mass_that_grows_while_it_is_pushed_is_a_drift():
     history = make_history(*rows, DT, capacity=160)
     (found,) = check([history])
     assert_names(found, "drift", [-0.2, -0.2])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["begin_2", "end_2"])
+def test_commands_of_which_little_acts_at_the_ends_of_runs_are_named(name):
+    """Half of them does, in two rows of each of five runs."""
+    state, acted, next_state = worlds.box_table(np.random.default_rng(16), 100)
+    place = np.arange(100) % 20
+    is_edge = place < 2 if name == "begin_2" else place >= 18
+    given = np.where(is_edge[:, None], 2.0, 1.0) * acted
+    rows = (part[:, None] for part in (state, given, next_state))
+    # Room that is not in use is no part of the last run.
+    history = make_history(*rows, DT, episode=np.arange(100) // 20, capacity=160)
+    (found,) = check([history])
+    assert_names(found, name, [-0.5])

@@ -144,7 +144,9 @@ def test_correlated_innovations_do_not_pass_and_few_are_not_judged():
 def random_path(rng) -> Path:
     shape = (30, 3)
     progress = (np.arange(30) + 0.5) / 30 - 0.5
-    return Path(*rng.normal(size=(5, *shape)), np.full((30, 2), 1e-3), progress)
+    row = np.arange(30) % 10
+    rest = np.full((30, 2), 1e-3), progress, row, 9 - row
+    return Path(*rng.normal(size=(5, *shape)), *rest)
 
 
 def test_laws_of_the_bodys_own_frame_turn_with_the_world():
@@ -161,6 +163,8 @@ def test_laws_of_the_bodys_own_frame_turn_with_the_world():
         path.change_ahead @ turn.T,
         path.spread,
         path.progress,
+        path.since_begin,
+        path.until_end,
     )
     for law in LAWS:
         if law.name in ("constant_force", "heading", "axis_limit"):
