@@ -154,8 +154,7 @@ def test_pins_are_where_the_readings_have_their_anchors(spec, prior):
     for axis in range(2):
         assert passes(anchor_a[:, axis], scipy.stats.norm(0, radius + spread))
         assert passes(off[:, axis], scipy.stats.johnsonsu(0, 1, scale=0.01 * radius))
-    model = make_model(spec, history, {"table": ["distance"]})
-    rod = drawn(model, 2000)
+    rod = drawn(make_model(spec, history, {"table": ["distance"]}), 2000)
     end = np.asarray(rod["table.distance.anchor_a"]) @ turn[0].T + poses[0, :2]
     gap = np.hypot(*np.transpose(end - rod["table.distance.anchor_b"]))
     assert passes(rod["table.distance.length"] / gap, lognormal(1.0, 0.1))
