@@ -119,7 +119,8 @@ def _only(history: History, is_kept: np.ndarray, reach: float) -> History:
     before, dt = np.asarray(history.episode), np.asarray(history.dt)
     begins = (np.diff(kept, prepend=-2) > 1) | (np.diff(before[kept], prepend=-1) != 0)
     rows, is_read, episode = [], [], []
-    for run in np.split(kept, np.flatnonzero(begins)[1:]) if len(kept) else []:
+    pieces = np.split(kept, np.flatnonzero(begins)[1:]) if len(kept) else []
+    for number, run in enumerate(pieces):
         first = run[0]
         while (
             first > 0
@@ -131,7 +132,7 @@ def _only(history: History, is_kept: np.ndarray, reach: float) -> History:
         num_unread = run[0] - first
         rows += [*range(first, run[0]), *run]
         is_read += [False] * num_unread + [True] * len(run)
-        episode += [len(episode) and episode[-1] + 1] * (num_unread + len(run))
+        episode += [number] * (num_unread + len(run))
     index, told = np.array(rows, int), np.array(is_read, bool)
     # What a row ends at is where the next one starts.
     is_last_told = told | (np.append(told[1:], False))
@@ -328,9 +329,9 @@ def _tells_a_stop(windows: _Windows) -> bool:
     # takes no more away than it and pushes do elsewhere, but hardly shows where a thing
     # mostly rests.
     most = np.max(np.abs(windows.change / spread)[is_inner])
-    is_once = at_end.max() > max(_ONCE, most) and pushed == 0
-    is_once &= elsewhere.max() < _HELD
-    is_once &= max(len(at_end), rests.sum()) <= len(elsewhere)
+    once = _ONCE * max(1.0, rests.sum() / num)
+    is_once = at_end.max() > max(once, most) and pushed == 0
+    is_once &= elsewhere.max() < _HELD and len(at_end) <= num
     return bool(is_often or is_once)
 
 
