@@ -196,8 +196,9 @@ def _is_stopped(way: Way) -> bool:
     """Whether it is held back at an end, by some of the ways to look at it."""
     if not np.isfinite(way.place).any():
         return False
-    by_speed = [_speed_windows(way)] if np.isfinite(way.speed).mean() > 0.5 else []
-    by_place = [_place_windows(way, lag) for lag in _LAGS]
+    still, speeds = _still(way), np.isfinite(way.speed).mean()
+    by_speed = [_speed_windows(way, still)] if speeds > 0.5 else []
+    by_place = [_place_windows(way, still, lag) for lag in _LAGS]
     return any(_tells_a_stop(windows) for windows in (*by_speed, *by_place))
 
 
@@ -232,7 +233,7 @@ def _sums(way: Way) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([zero, whole])[:-1], np.concatenate([zero, moment])[:-1]
 
 
-def _place_windows(way: Way, lag: int) -> _Windows:
+def _place_windows(way: Way, still: np.ndarray, lag: int) -> _Windows:
     """Of three places each, so many readings apart."""
     known = np.flatnonzero(np.isfinite(way.place))
     run = way.run[known]
@@ -258,14 +259,14 @@ def _place_windows(way: Way, lag: int) -> _Windows:
         pushes,
         0.5 * (came + goes),
         0.5 * (before + after),
-        _still(way)[b],
+        still[b],
         (is_high, is_low),
         0.5 * np.sqrt(6.0) * way.noise / step,
         lag,
     )
 
 
-def _speed_windows(way: Way) -> _Windows:
+def _speed_windows(way: Way, still: np.ndarray) -> _Windows:
     """Of speeds read at two instants, one after the other."""
     known = np.flatnonzero(np.isfinite(way.place) & np.isfinite(way.speed))
     is_next = way.run[known[1:]] == way.run[known[:-1]]
@@ -278,8 +279,7 @@ def _speed_windows(way: Way) -> _Windows:
         np.min([q[a], q[b], ahead], axis=0, initial=np.inf),
         np.max([q[a], q[b], ahead], axis=0, initial=-np.inf),
     )
-    is_still = _still(way)
-    is_still = is_still[a] & is_still[b]
+    is_still = still[a] & still[b]
     speed = 0.5 * (v[a] + v[b])
     pushes = whole[b] - whole[a]
     return _windows(v[b] - v[a], pushes, speed, length, is_still, ends, 0.0, 1)

@@ -84,14 +84,13 @@ def find_ways(
         lever = np.column_stack(
             [cos * arm[0] - sin * arm[1], sin * arm[0] + cos * arm[1]]
         )
+        pins = values[:, :2] - lever
+        is_read = np.all(np.isfinite(pins), axis=1)
+        pin = pins[is_read].mean(axis=0) if is_read.any() else np.full(2, np.nan)
         lever = np.nan_to_num(lever)
         force = [_torque(wrench[:, body], lever), steady]
         if np.any(gravity != 0.0):
             force += [lever]
-        pins = values[:, :2] - lever
-        pin = np.sum(np.nan_to_num(pins), axis=0) / max(
-            1, np.isfinite(pins[:, 0]).sum()
-        )
         for other in others:
             force += [_torque(wrench[:, other], poses[:, other, :2] - pin)]
         ways.append(
