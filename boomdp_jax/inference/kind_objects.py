@@ -30,7 +30,11 @@ from boomdp_jax.inference.likelihood_fit import fit_bumps
 from boomdp_jax.inference.noise_level import NoiseFit
 from boomdp_jax.inference.population import sample_population
 from boomdp_jax.inference.prior import LOGARITHMIC
-from boomdp_jax.inference.structure_draws import SampleSettings, start_mixtures
+from boomdp_jax.inference.structure_draws import (
+    SampleSettings,
+    chains_agree,
+    start_mixtures,
+)
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.physics.scene_spec import SceneSpec
 
@@ -176,7 +180,13 @@ def _sample_group(
     targets = found.targets
     report("sampling each body by itself")
     mixtures = start_mixtures(targets, found.modes)
-    population = sample_population(chain_key, targets, mixtures, settings.population)
+    population = sample_population(
+        chain_key,
+        targets,
+        mixtures,
+        settings.population,
+        is_mixed=lambda draws: chains_agree(targets, draws),
+    )
     draws, evidence = population.draws, population.evidence
     num_objects = targets.structures.shape[0]
     structure = np.asarray(draws.structure).reshape(num_objects, -1)

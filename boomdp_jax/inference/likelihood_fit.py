@@ -31,7 +31,9 @@ class StructureDraws:
             weight: of each draw; need not be normalised.
         """
         kept = weight > 0
-        self.z, self.weight = z[kept], weight[kept] / max(weight[kept].sum(), 1e-300)
+        # By the largest first: of a structure all but impossible the sum is no number.
+        weight = weight[kept] / weight[kept].max(initial=0.0)
+        self.z, self.weight = z[kept], weight / max(weight.sum(), 1.0)
 
     @property
     def size(self) -> float:

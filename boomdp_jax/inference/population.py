@@ -56,14 +56,15 @@ class PopulationSettings(NamedTuple):
     num_walkers: int = 64
     """Of each chain."""
     num_warmup: int = 4
-    """Sweeps that a last component is fitted to and that are thrown away."""
+    """Sweeps that a component is fitted to and that are thrown away."""
     num_sweeps: int = 8
     """Sweeps that are kept; each gives one draw per walker."""
     num_importance: int = 2048
     """Draws of each round that adapts the mixture; the last ones are the evidence."""
     max_doublings: int = 4
     """How often the number of sweeps of an object may double, of which then every
-    second is kept, where its chains do not agree yet."""
+    second is kept, where its chains do not agree yet; the component is then fitted
+    anew."""
 
 
 class Population(NamedTuple):
@@ -129,10 +130,7 @@ def sample_population(
     if places:
         can_change = _can_change(counts)
         counts = no_moves(num_objects)
-        visited = (np.concatenate(part, axis=1) for part in zip(*places, strict=True))
-        mixtures = fit_spare(targets, mixtures, *visited)
-        proposal = log_proposal_of(targets, mixtures, points.structure, points.z)
-        points = eqx.tree_at(lambda p: p.log_proposal, points, proposal)
+        mixtures, points = _refitted(targets, mixtures, points, places)
     draws, kept, every = None, [], 1
     for doubling in range(settings.max_doublings + 1):
         if doubling > 1:
@@ -147,14 +145,37 @@ def sample_population(
         # Those whose chains agreed before have not moved since.
         draws = latest if draws is None else taken_over(is_open, latest, draws)
         is_open = is_open & ~np.broadcast_to(is_mixed(draws), num_objects)
-        if not np.any(is_open):
+        if not np.any(is_open) or doubling == settings.max_doublings:
             break
+        # Walkers that started from few draws have gone further by now.
+        places = [(np.asarray(p.structure), np.asarray(p.z)) for p in kept]
+        mixtures, points = _refitted(targets, mixtures, points, places)
     assert draws is not None
     return Population(
         draws=draws,
         counts=counts,
         evidence=evidence,
     )
+
+
+def _refitted(
+    targets: StructureTarget,
+    mixtures: LaplaceMixture,
+    points: Point,
+    places: list[tuple[np.ndarray, np.ndarray]],
+) -> tuple[LaplaceMixture, Point]:
+    """Mixtures with a component where walkers came by, which walk on with them.
+
+    Args:
+        targets: stacked along a leading object axis.
+        mixtures: one of each object, with spare components.
+        points: where walkers stand.
+        places: structures and coordinates of all of them, sweep after sweep.
+    """
+    visited = (np.concatenate(part, axis=1) for part in zip(*places, strict=True))
+    mixtures = fit_spare(targets, mixtures, *visited)
+    proposal = log_proposal_of(targets, mixtures, points.structure, points.z)
+    return mixtures, eqx.tree_at(lambda p: p.log_proposal, points, proposal)
 
 
 def _can_change(counts: MoveCounts) -> np.ndarray:

@@ -27,10 +27,10 @@ from boomdp_jax.inference.noise_correction import infer_noise, noise_about_peaks
 from boomdp_jax.inference.noise_level import NoiseFit
 from boomdp_jax.inference.noise_scales import draw_noise_scales
 from boomdp_jax.inference.population import Population, sample_population
-from boomdp_jax.inference.structure_chain import ChainDraws
 from boomdp_jax.inference.structure_draws import (
     SampleSettings,
     StructureDraws,
+    chains_agree,
     pick_object,
     start_mixtures,
 )
@@ -46,8 +46,6 @@ from boomdp_jax.inference.tempered_smc import sample_tempered
 from boomdp_jax.inference.walker_moves import MoveCounts
 from boomdp_jax.inference.weighing import evaluate_each
 
-# Chains of an object go on where an R-hat exceeds this.
-_R_HAT = 1.015
 # Importance sampling is heard only with as many effective draws.
 _MIN_SAMPLE_SIZE = 100.0
 
@@ -233,7 +231,7 @@ def sample_by_jumps(
         start_mixtures(targets, modes),
         settings.population,
         evaluate=evaluate,
-        is_mixed=lambda draws: _are_mixed(targets, draws),
+        is_mixed=lambda draws: chains_agree(targets, draws),
     )
     draws = population.draws
     evidence = evidence_by_importance(
@@ -322,17 +320,6 @@ def _rehearse(
         middle = np.argsort(Host.of(targets).in_use.sum(axis=1))[[num_structures // 2]]
         known = targets, first, middle, np.zeros((1, dim)), np.eye(dim)[None]
         LinearTracks.along(*known, noise)(first, noise)
-
-
-def _are_mixed(targets: StructureTarget, draws: ChainDraws) -> np.ndarray:
-    """Whether the chains of each object agree, `[object]`."""
-    verdicts = [
-        diagnose_chains(*pick_object((targets, draws), index))
-        for index in range(targets.structures.shape[0])
-    ]
-    largest = [max(verdict.r_hat.values(), default=1.0) for verdict in verdicts]
-    # Too few draws to tell count as agreeing: more would be as few.
-    return ~(np.array(largest) > _R_HAT)
 
 
 def _diagnose(

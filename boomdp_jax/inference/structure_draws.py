@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from boomdp_jax.core.quick_compile import QuickCompile
-from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics
+from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics, diagnose_chains
 from boomdp_jax.inference.fit import FitSettings, Modes
 from boomdp_jax.inference.laplace_mixture import LaplaceMixture
 from boomdp_jax.inference.mixture_building import (
@@ -16,8 +16,12 @@ from boomdp_jax.inference.mixture_building import (
     laplace_mixture,
 )
 from boomdp_jax.inference.population import PopulationSettings
+from boomdp_jax.inference.structure_chain import ChainDraws
 from boomdp_jax.inference.structure_evidence import StructureEvidence
 from boomdp_jax.inference.target import StructureTarget
+
+# Chains of an object go on where an R-hat exceeds this.
+_R_HAT = 1.015
 
 
 class SampleSettings(NamedTuple):
@@ -82,3 +86,19 @@ def start_mixtures(targets: StructureTarget, modes: Modes) -> LaplaceMixture:
 def pick_object(tree, index: int):
     """One object of a batch, on the host."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[index], tree)
+
+
+def chains_agree(targets: StructureTarget, draws: ChainDraws) -> np.ndarray:
+    """Whether the chains of each object may end, `[object]`.
+
+    Args:
+        targets: stacked along a leading object axis.
+        draws: `[object, chain, draw]`.
+    """
+    verdicts = [
+        diagnose_chains(*pick_object((targets, draws), index))
+        for index in range(targets.structures.shape[0])
+    ]
+    largest = [max(verdict.r_hat.values(), default=1.0) for verdict in verdicts]
+    # Too few draws to tell count as agreeing: more would be as few.
+    return ~(np.array(largest) > _R_HAT)

@@ -84,6 +84,13 @@ def test_moments_of_a_heading_do_not_mind_where_it_is_cut():
     assert covariance[0, 1] == pytest.approx(0.003, rel=0.1)
 
 
+@pytest.mark.parametrize("scale", [1.0, 1e-200, 1e-315])
+def test_draws_of_a_structure_all_but_impossible_are_counted_right(scale):
+    z = np.arange(6.0)[:, None]
+    draws = StructureDraws(z, scale * np.array([1.0, 1.0, 2.0, 0.0, 1.0, 3.0]))
+    np.testing.assert_allclose(draws.size, 8.0**2 / 16.0, rtol=1e-6)
+
+
 def test_a_structure_without_draws_is_fitted_by_its_mode():
     rng = np.random.default_rng(3)
     in_use = np.array([[True, False], [True, True]])

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from boomdp_jax.inference import population as population_module
 from boomdp_jax.inference.block import make_block, stack_blocks
 from boomdp_jax.inference.evaluate import evaluate_points
 from boomdp_jax.inference.find_modes import find_modes
@@ -17,6 +18,7 @@ from boomdp_jax.inference.mixture_building import (
     laplace_mixture,
 )
 from boomdp_jax.inference.population import PopulationSettings, sample_population
+from boomdp_jax.inference.spare_fit import fit_spare
 from tests.inference.recordings import box_scene, free_box
 
 pytestmark = pytest.mark.slow
@@ -109,17 +111,24 @@ def test_every_move_is_made_and_accepted(population):
 
 
 @pytest.mark.parametrize("num_refusals", [0, 1, 2, 5])
-def test_sweeps_double_until_the_chains_agree(problem, num_refusals):
+def test_sweeps_double_until_the_chains_agree(problem, num_refusals, monkeypatch):
     targets, target, laplace = problem
     mixture = add_spare_components(target, laplace)
     stacked = jax.tree.map(lambda leaf: leaf[None], mixture)
     settings = PopulationSettings(
         num_chains=2, num_walkers=8, num_warmup=1, num_sweeps=3, num_importance=64
     )
-    shapes, num_calls = [], 0
+    shapes, seen, fitted, num_calls = [], [], [], 0
+
+    def fit_and_tell(targets, mixtures, structure, z):
+        fitted.append(np.sort(z, axis=None))
+        return fit_spare(targets, mixtures, structure, z)
+
+    monkeypatch.setattr(population_module, "fit_spare", fit_and_tell)
 
     def is_mixed(draws):
         shapes.append(draws.z.shape)
+        seen.append(np.sort(draws.z, axis=None))
         return len(shapes) > num_refusals
 
     def evaluate(targets, structure, z):
@@ -140,6 +149,10 @@ def test_sweeps_double_until_the_chains_agree(problem, num_refusals):
     assert len(shapes) == num_doublings + 1
     # However many sweeps are made, as many are kept.
     assert set(shapes) == {(1, 2, 24, targets.slot.shape[1])}
+    # After warm-up, and each time on all draws so far, the moves are fitted anew.
+    assert len(fitted) == num_doublings + 1
+    for places, draws in zip(fitted[1:], seen, strict=False):
+        np.testing.assert_array_equal(places, draws)
     num_sweeps = settings.num_warmup + settings.num_sweeps * 2**num_doublings
     assert num_calls == 5 * num_sweeps
     assert found.counts.proposed.sum() <= 5 * 16 * (num_sweeps - settings.num_warmup)
