@@ -1,5 +1,6 @@
 """Draws of blocks put together: one posterior of the whole scene."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -46,8 +47,12 @@ def assemble_posterior(
         method: how the draws were made.
 
     Returns:
-        The posterior of the whole scene.
+        The posterior of the whole scene. Its `spec` has as many substeps as the
+        likelihoods had where these were more, so that what it predicts moves as they
+        took it to move.
     """
+    spec, more = _as_stepped(spec, results)
+    notes = [*notes, *more]
     num_chains = max((len(r.draws.chain_index) for r in results), default=1)
     posterior_parts, prior_parts, noise_parts, prior_noise_parts = [], [], [], []
     impulse_parts, prior_impulse_parts = [], []
@@ -110,6 +115,28 @@ def assemble_posterior(
         else None,
         seconds=seconds,
     )
+
+
+def _as_stepped(
+    spec: SceneSpec, results: list[BlockResult]
+) -> tuple[SceneSpec, list[str]]:
+    """The scene with steps cut as the likelihoods cut them, and a note where they did.
+
+    Args:
+        spec: the scene.
+        results: its blocks.
+    """
+    num_parts = spec.scene.num_substeps
+    for result in results:
+        likelihood: Any = result.block.target.log_likelihood
+        num_parts = max(num_parts, likelihood.coordinates.scene.num_substeps)
+    if spec.substeps is not None or num_parts == spec.scene.num_substeps:
+        return spec, []
+    note = (
+        f"steps are made in {num_parts} parts for how far bodies turn in one, in "
+        f'predictions too; "substeps" in the scene makes them in as many as it says'
+    )
+    return dataclasses.replace(spec, substeps=num_parts), [note]
 
 
 def _prior_coordinates(rng: np.random.Generator, target) -> np.ndarray:

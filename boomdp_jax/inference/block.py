@@ -22,6 +22,7 @@ from boomdp_jax.inference.track_data import track_data
 from boomdp_jax.inference.tracking import one_step_gains
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.scene_spec import SceneSpec
+from boomdp_jax.physics.turns import parts_for_turns
 
 # A step of up to so many seconds is one part in likelihoods of several bodies, whose
 # time is spent in steps: of two pairs that were pushed for a second the evidence was no
@@ -32,15 +33,6 @@ from boomdp_jax.physics.scene_spec import SceneSpec
 # which passed for noise of the motion: with two parts the evidence of six doors that
 # MuJoCo moved rose by 0 to 45 nats, that of eight tables on a floor by -3 to 43.
 _LONGEST_WHOLE_STEP = 0.05
-# What a push does by way of a pin, a rod or a wheel turns with the body, and a part of
-# a step takes it as it is in the middle, which leaves out a share of the square of the
-# turn over 24. A lone box on a pin that turned by 0.4 rad a part came out 0.6 % too
-# heavy, by four sds; two boxes on a pin, at 0.45 rad a part, were 6 mrad off after one,
-# a rod 5. So far a part may turn [rad], from a turn in a step on that matters; parts
-# are a power of two, since each number is a program, and so many at most.
-_TURN_OF_PART, _LEAST_TURN, _MOST_PARTS = 0.15, 0.2, 8
-_SHARE_OF_STEPS = 0.9
-"""Share of steps in which bodies turn by less than what counts."""
 
 
 class Block(NamedTuple):
@@ -79,8 +71,9 @@ def make_block(
         touching: what may have touched; None: nothing collides.
         freedom: degrees of freedom of the readings' Student-t noise; None: normal.
         is_told: whether readings tell what the bodies are, or only where.
-        cuts_turns: whether steps are cut by how far bodies are read to turn. Not where
-            shapes must not depend on readings.
+        cuts_turns: whether steps are cut by how far bodies are read to turn, where the
+            scene does not say in how many parts they are made. Not where shapes must
+            not depend on readings.
 
     Returns:
         The block.
@@ -114,7 +107,7 @@ def make_block(
         raise ValueError(f"{error}; {why}") from None
     poses = _poses(trusted, bodies)
     num_parts = 1
-    if cuts_turns:
+    if cuts_turns and spec.substeps is None:
         num_parts = _parts_of_turns(history, bodies)
     coordinates = Coordinates(
         layout=layout,
@@ -122,7 +115,7 @@ def make_block(
         surroundings=surroundings(
             spec, bodies, layout, poses, _forces(history, bodies)
         ),
-        scene=_block_scene(spec.scene, bodies, np.asarray(history.dt), num_parts),
+        scene=_block_scene(spec, bodies, np.asarray(history.dt), num_parts),
         contact=contact,
     )
     if is_uniform is None:
@@ -203,34 +196,25 @@ def _parts_of_turns(history: History, bodies: tuple[int, ...]) -> int:
     turned = np.abs(np.angle(np.exp(1j * (last[..., 2] - first[..., 2]))))
     by_spin = np.abs(last[..., 5]) * np.asarray(history.dt, float)[:, None]
     turned = np.where(np.isfinite(turned), turned, by_spin)
-    turned = turned[np.asarray(history.mask)]
-    turns = [
-        float(np.quantile(own[np.isfinite(own)], _SHARE_OF_STEPS))
-        for own in turned.T
-        if np.any(np.isfinite(own))
-    ]
-    most = max(turns, default=0.0)
-    if most < _LEAST_TURN:
-        return 1
-    parts = most / _TURN_OF_PART
-    return min(1 << int(np.ceil(np.log2(parts))), _MOST_PARTS)
+    return parts_for_turns(turned[np.asarray(history.mask)])
 
 
 def _block_scene(
-    scene: Scene, bodies: tuple[int, ...], dt: np.ndarray, num_parts: int
+    spec: SceneSpec, bodies: tuple[int, ...], dt: np.ndarray, num_parts: int
 ) -> Scene:
     """The scene of a block's bodies; outlines shrink to a point: see `contact`.
 
     Args:
-        scene: of all bodies.
+        spec: of all bodies.
         bodies: of the block.
         dt: lengths of steps [s].
         num_parts: in which steps are to be cut at least.
     """
-    index = np.asarray(bodies)
+    scene, index = spec.scene, np.asarray(bodies)
     # Of all rows, unused ones too: an online table holds its length from the start.
     longest = float(np.max(dt)) if dt.size else float(scene.dt)
     is_whole = len(bodies) > 1 and longest <= _LONGEST_WHOLE_STEP
+    is_whole = is_whole and spec.substeps is None
 
     def pick(array):
         picked = np.asarray(array)[index]

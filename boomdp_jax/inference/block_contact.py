@@ -58,7 +58,7 @@ def block_contact(
         whole,
         **picked,
         collides=on_device(collides, bool),
-        num_substeps=NUM_SUBSTEPS,
+        num_substeps=NUM_SUBSTEPS if spec.substeps is None else spec.substeps,
     )
     pairs = [(int(a), int(b)) for a, b in np.argwhere(np.triu(collides))]
     is_disc = np.array([spec.bodies[i].radius > 0 for i in index])

@@ -243,8 +243,15 @@ def _sliding(
     if body.pivot is not None:
         x, y = body.pivot.anchor
         slide_x, slide_y = slide_x - y * spin, slide_y + x * spin
-        moment = moment + y * push_x - x * push_y
-        inertia = inertia + body.mass * half[0] * (x * x + y * y)
+        # About the pin the whole inertia turns, whatever the frame. An impulse is
+        # spread over the substep, while its lever turns: on the mean its moment is
+        # sin(a) / a of that at mid-step, and a force does the work of its way.
+        about = body.mass * (x * x + y * y)
+        square = angle * angle
+        spread = 1.0 - square * (1.0 / 6.0) * (1.0 - square * (1.0 / 20.0))
+        spread_x, spread_y = into(middle, impulse[0], impulse[1])
+        moment = moment + about * spin + spread * (y * spread_x - x * spread_y)
+        inertia = inertia + about
     problem = SlidingProblem(
         push=(push_x, push_y, moment),
         start=(slide_x, slide_y, spin),

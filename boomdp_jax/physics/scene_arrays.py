@@ -40,6 +40,7 @@ def build_scene(
     gravity: np.ndarray,
     normal_gravity: float,
     dt: float,
+    substeps: int | None = None,
     *,
     num_vertices: int = MIN_VERTICES,
     num_feet: int = MIN_FEET,
@@ -51,12 +52,15 @@ def build_scene(
         gravity: in-plane gravity [m/s²].
         normal_gravity: gravity across the plane [m/s²].
         dt: default length of a step [s].
+        substeps: in how many parts a step is made; None: two, four with contact.
         num_vertices: least room for corners of each body.
         num_feet: least room for feet of each body.
 
     Returns:
         The scene, on the default float type.
     """
+    if substeps is None:
+        substeps = 4 if has_contact(bodies) else 2
     num_vertices = max(num_vertices, *(len(body.outline) for body in bodies))
     num_feet = max(num_feet, *(len(body.feet) for body in bodies))
     vertex_mask = [np.arange(num_vertices) < len(body.outline) for body in bodies]
@@ -85,7 +89,7 @@ def build_scene(
             normal_gravity=on_device(normal_gravity),
             dt=on_device(dt),
             collides=_collides(bodies),
-            num_substeps=4 if has_contact(bodies) else 2,
+            num_substeps=substeps,
         )
 
 

@@ -137,19 +137,21 @@ def read_flag(value: object, where: str) -> bool:
     return value
 
 
-def read_count(value: object, where: str, *, most: int) -> int:
-    """Check that a value is a whole number from 0 to `most`.
+def read_count(value: object, where: str, *, least: int = 0, most: int) -> int:
+    """Check that a value is a whole number from `least` to `most`.
 
     Args:
         value: what stands in the file.
         where: file, body and field.
+        least: smallest count allowed.
         most: largest count allowed.
 
     Returns:
         The count.
     """
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most:
-        refuse(where, f"a whole number from 0 to {most}", value)
+    is_whole = isinstance(value, int) and not isinstance(value, bool)
+    if not is_whole or not least <= value <= most:
+        refuse(where, f"a whole number from {least} to {most}", value)
     return value
 
 

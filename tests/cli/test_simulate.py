@@ -287,3 +287,22 @@ def test_bodies_in_contact_move_as_in_a_rollout(folder: Path):
     )
     np.testing.assert_allclose(table.next_state[..., :3], states.pose, atol=1e-9)
     np.testing.assert_allclose(table.next_state[..., 3:], states.twist, atol=1e-9)
+
+
+@pytest.mark.parametrize(("rate", "parts"), [(5.0, None), (25.0, 4)])
+def test_steps_are_cut_by_how_far_a_body_turns(folder: Path, capsys, rate, parts):
+    scene = json.loads((folder / "scene.json").read_text())
+    scene["bodies"][1]["twist"] = [0.0, 0.0, rate]
+    (folder / "scene.json").write_text(json.dumps(scene))
+    np.savez("a.npz", action=_action(10, (3.0, -2.0, 0.0)))
+    _simulate()
+    said = f"steps are made in {parts} parts for how far bodies turn in one"
+    assert (said in capsys.readouterr().err) == (parts is not None)
+    origin = json.loads(str(np.load("out.npz")["params"]))
+    assert origin["scene"].get("substeps") == parts
+    # What a scene says goes first.
+    scene["substeps"] = 3
+    (folder / "scene.json").write_text(json.dumps(scene))
+    _simulate()
+    assert "parts" not in capsys.readouterr().err
+    assert json.loads(str(np.load("out.npz")["params"]))["scene"]["substeps"] == 3

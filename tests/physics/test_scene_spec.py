@@ -245,6 +245,23 @@ def test_normal_gravity_is_there_where_the_plane_is_level(
     np.testing.assert_allclose(spec.scene.normal_gravity, normal_gravity)
 
 
+def test_a_scene_may_say_in_how_many_parts_a_step_is_made():
+    spec = scene_spec_from_dict({**_scene(), "substeps": 7})
+    assert spec.scene.num_substeps == 7
+    assert scene_spec_from_dict(spec.to_dict()).substeps == 7
+    # Else it is two, or four where there is contact, and its file does not say.
+    spec = scene_spec_from_dict({**_scene(), "substeps": None})
+    assert (spec.substeps, spec.scene.num_substeps) == (None, 4)
+    assert "substeps" not in spec.to_dict()
+
+
+@pytest.mark.parametrize("value", [0, -1, 2.5, True, "2", 257])
+def test_parts_of_a_step_are_counted(value):
+    message = "scene: substeps: expected a whole number from 1 to 256, got "
+    with pytest.raises(ValueError, match=message):
+        scene_spec_from_dict({**_scene(), "substeps": value})
+
+
 def test_a_missing_cap_is_zero():
     spec = scene_spec_from_dict(_scene())
     others = ("revolute", "distance", "prismatic", "weld", "ground")
