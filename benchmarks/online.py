@@ -34,7 +34,9 @@ def main() -> None:
     parser.add_argument("--capacity", type=int, default=256)
     parser.add_argument("--particles", type=int, default=1024)
     parser.add_argument("--steps", type=int, default=100, help="that are timed")
-    parser.add_argument("--seeds", type=int, default=3, help="recoveries of each case")
+    parser.add_argument(
+        "--seeds", type=int, default=3, help="recoveries of each case; 0: none"
+    )
     arguments = parser.parse_args()
     reporter = Reporter(arguments.out)
     if arguments.quick:
@@ -53,7 +55,8 @@ def main() -> None:
         belief = online.init(jax.random.key(0), history)
         time_steps(reporter, online, belief, rows, num_fitted)
         check_answer(reporter, online, rows)
-        for case, names in WORLDS.items():
+        # Of no recoveries there is no worst.
+        for case, names in WORLDS.items() if arguments.seeds else ():
             recover(reporter, online, case, names, arguments.seeds)
     reporter.print_table()
 

@@ -13,6 +13,7 @@ from boomdp_jax.experiments.scores import (
     PUBLISHED,
     LoadedRun,
     Score,
+    band_name,
     check_comparable,
     check_is_run,
     load_run,
@@ -68,6 +69,7 @@ def report(
             for name, loaded in zip(names, runs, strict=True)
         },
         title=title or runs[0].setting,
+        band=band_name(runs),
     )
     figure.savefig(path, dpi=150)
     found = scores(runs)

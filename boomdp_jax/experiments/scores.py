@@ -23,6 +23,9 @@ MARKS: Mapping[str, tuple[float, ...]] = MappingProxyType(
 """By task; others have those of the cart."""
 
 _NUM_RESAMPLES, _COVERAGE = 1000, 0.95
+# Of two or three seeds the bootstrap's band is the range of their curves, which holds
+# the mean of normal ones in 50 and 75 % of cases; of four that is 79, of five 84, of
+# twenty 93 %.
 _LEAST_FOR_BAND = 5
 
 
@@ -236,6 +239,20 @@ def mean_band(
     tells = is_there.sum(axis=0) >= min(num, _LEAST_FOR_BAND)
     ends[:, tells] = np.nanpercentile(drawn[:, tells], [tail, 100 - tail], axis=0)
     return mean, ends[0], ends[1]
+
+
+def band_name(runs: Sequence[LoadedRun]) -> str:
+    """What bands of runs by `mean_band` may be called.
+
+    Args:
+        runs: of which they are, one or more.
+    """
+    counts = [len(run.reward) for run in runs]
+    if min(counts) >= _LEAST_FOR_BAND:
+        return "95 % band"
+    if max(counts) < _LEAST_FOR_BAND:
+        return "bootstrap range of few seeds"
+    return f"95 % band; under {_LEAST_FOR_BAND} seeds bootstrap range"
 
 
 def scores(runs: Sequence[LoadedRun]) -> list[Score]:

@@ -9,6 +9,10 @@ where W weighs channel groups by what their noise turned out to be. I is the Fis
 information of the filter's likelihood in units of the prior; a number of which it is
 nought is not seen, whatever is sampled. (Directions such as a wheel's heading, uniform
 over half a turn, have no prior precision: a coordinate is an angle in radians.)
+
+Noise is that of a point fit, in which the motion's is taken one sd of its logarithm
+above its peak. Where motion is nearly exact that is often 3 to 10 times what `infer`
+finds, and sds that follow from I are 1.1 to 1.7 times those of the posterior.
 """
 
 from typing import NamedTuple
@@ -47,7 +51,8 @@ class Identifiability(NamedTuple):
     reading_noise: np.ndarray
     """Sd of readings at the fit, `[body, 4]` [m, rad, m/s, rad/s]."""
     impulse_noise: np.ndarray
-    """Sd of the motion's impulses, `[body, 2]` [m/s, rad/s]."""
+    """Sd of the motion's impulses that is reckoned with, `[body, 2]` [m/s, rad/s]:
+    above the most probable one, often far above the posterior's."""
 
     @property
     def insensitive(self) -> tuple[str, ...]:
@@ -67,6 +72,9 @@ def identifiability(
     settings: FitSettings | None = None,
 ) -> list[Identifiability]:
     """Fisher information of a history about the numbers of one structure.
+
+    Noise is fitted and not averaged over, that of the motion on the high side: the
+    information is rather too low than too high.
 
     Args:
         key: random key, for the starts of the fit.

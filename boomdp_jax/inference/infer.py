@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import jax
 import numpy as np
@@ -17,12 +17,16 @@ from boomdp_jax.core.spread import spread_over
 from boomdp_jax.inference.arguments import check_arguments
 from boomdp_jax.inference.assemble import assemble_posterior
 from boomdp_jax.inference.batch_blocks import blocks_of_batch
+from boomdp_jax.inference.between_stops import again_between_stops
 from boomdp_jax.inference.block import stack_blocks
 from boomdp_jax.inference.doubts import with_doubts, with_notes
-from boomdp_jax.inference.end_stops import without_stops
 from boomdp_jax.inference.evidence_report import BlockResult
 from boomdp_jax.inference.fixed_structure import Structure, check_structure
-from boomdp_jax.inference.likelihoods import ChosenLikelihood, choose_likelihood
+from boomdp_jax.inference.likelihoods import (
+    ChosenLikelihood,
+    choose_likelihood,
+    outlier_remedy,
+)
 from boomdp_jax.inference.members import Refusals
 from boomdp_jax.inference.nuts import run_nuts
 from boomdp_jax.inference.one_structure import check_numbers
@@ -38,10 +42,6 @@ from boomdp_jax.physics.scene_spec import SceneSpec
 
 METHODS = ("auto", "rj", "enumerate", "smc", "nuts", "svi", "laplace", "map")
 """Ways to infer: `auto` is `rj`."""
-
-# Rows between stops, at least, to be inferred from alone; and what parts the random
-# numbers of that from those before.
-_FEWEST_FREE, _STOPS_KEY = 20, 0x5709
 
 OUTLIERS = {"none": None, "student-t": DEGREES_OF_FREEDOM}
 """Degrees of freedom of the noise of readings; None: it is normal."""
@@ -66,8 +66,9 @@ def infer(
     """Posterior over densities, joints, wheels, friction, noise, and which exist.
 
     Hypotheses know no ends of a way. Where a drawer or a door seems to come against
-    one, rows in which it may have done so are left out, and a note says how many (not
-    with `nuts` and `svi`, which only doubt it).
+    one, rows in which it may have done so are left out, and a note says how many. (With
+    `nuts` and `svi`, and where what is left cannot be inferred from, it is only
+    doubted.)
 
     Args:
         key: random key.
@@ -158,7 +159,9 @@ def infer_batch(
     """The same for many scenes; equal blocks of bodies share one compiled call.
 
     Histories of different lengths are padded to the longest, so that they share it
-    too; one of less than a quarter of that length, to a quarter, and so on.
+    too; one of less than a quarter of that length, to a quarter, and so on. Members
+    share padding and random numbers as well: with another recording of one of them the
+    draws of the others are others, though of the same law.
 
     Args:
         key: random key.
@@ -237,17 +240,17 @@ def infer_batch(
                 likelihood=chosen,
             )
             posteriors = run_structures(key, specs, histories)
-            histories = _again_without_stops(
+            histories = again_between_stops(
                 run_structures, key, specs, histories, posteriors
             )
-    entries = chosen.diagnostics
+    entries, remedy = chosen.diagnostics, outlier_remedy(chosen.name, method)
     if outliers != "none":
         entries["degrees_of_freedom"] = OUTLIERS[outliers]
     posteriors = [with_diagnostics(posterior, (), entries) for posterior in posteriors]
     for index, (spec, history) in enumerate(zip(specs, histories, strict=True)):
         notes = []
         if outliers == "none":
-            notes = [*chosen.notes, *outlier_notes(spec, history)]
+            notes = [*chosen.notes, *outlier_notes(spec, history, remedy)]
         posteriors[index] = with_doubts(posteriors[index], spec, history, notes)
     seed = seed_of(key)
     return [dataclasses.replace(posterior, seed=seed) for posterior in posteriors]
@@ -288,38 +291,6 @@ def checked_options(
     return counts, choose_likelihood(
         likelihood, horizon, method=method, outliers=outliers
     )
-
-
-def _again_without_stops(
-    run_structures: Callable[..., list[Posterior]],
-    key: Key,
-    specs: Sequence[SceneSpec],
-    histories: Sequence[History],
-    posteriors: list[Posterior],
-) -> list[History]:
-    """Put posteriors of what comes against stops right, in place.
-
-    Returns:
-        The rows that were inferred from.
-    """
-    kept, again = list(histories), []
-    for index, posterior in enumerate(posteriors):
-        free, notes = without_stops(posterior, histories[index])
-        if notes and free.num_transitions >= _FEWEST_FREE:
-            kept[index] = free
-            again.append((index, notes))
-    if again:
-        found = run_structures(
-            jax.random.fold_in(key, _STOPS_KEY),
-            [specs[index] for index, _ in again],
-            [kept[index] for index, _ in again],
-        )
-        for (index, notes), posterior in zip(again, found, strict=True):
-            before = posteriors[index].seconds
-            seconds = {name: before[name] + s for name, s in posterior.seconds.items()}
-            posterior = dataclasses.replace(posterior, seconds=seconds)
-            posteriors[index] = with_notes(posterior, notes)
-    return kept
 
 
 def _infer_structures(

@@ -130,3 +130,17 @@ def choose_likelihood(
             f"{outliers!r}; likelihood 'filtered' takes it"
         )
     return ChosenLikelihood(likelihood, horizon)
+
+
+def outlier_remedy(likelihood: str, method: str) -> str:
+    """What to do about gross errors, in words that `choose_likelihood` accepts.
+
+    Args:
+        likelihood: any of `LIKELIHOODS` but `auto`.
+        method: of inference.
+    """
+    if method in _OF_ONE_STRUCTURE:
+        return "outliers='student-t' with likelihood='filtered' and method='auto'"
+    if likelihood == "filtered":
+        return "outliers='student-t'"
+    return "outliers='student-t' with likelihood='filtered'"

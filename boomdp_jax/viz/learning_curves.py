@@ -1,6 +1,7 @@
 """Curves of runs over steps and of learners over samples, with bands."""
 
-from collections.abc import Mapping, Sequence
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,9 @@ _LONG = 100
 """Steps from which on their axis is logarithmic, so that the first ones are seen."""
 _BY_AGENT = {
     "true": EDGE,
+    "true-way": EDGE,
     "physics": PREDICTION,
+    "physics-way": PREDICTION,
     "physics-pretrained": SLIDE,
     "physics-kinds": FLOOR,
     "physics-map": FLOOR,
@@ -49,7 +52,41 @@ _BY_AGENT = {
     "ensemble": PIN,
     "random": STATIC,
 }
-"""Agents that are shown together differ."""
+"""Those of one colour differ by their strokes where they are shown together."""
+# More agents than colours that a colour-blind reader tells apart.
+_COLOURS = (EDGE, PREDICTION, PIN, BASELINE, FLOOR, SLIDE, ROD, STATIC)
+_STROKES = ("-", "--", ":", "-.", (0, (6.0, 1.5, 1.0, 1.5, 1.0, 1.5)))
+_WIDEST_LABEL = 40
+"""Letters of a line beside an axis."""
+_LEGEND_LENGTH = 3.5
+"""Of a stroke in the legend, in sizes of its letters: two would not show a pattern."""
+
+Line = tuple[str, Any]
+"""Colour and stroke."""
+
+
+def lines_of(names: Iterable[str]) -> dict[str, Line]:
+    """A line for each curve of a figure, no two alike.
+
+    An agent has its own colour, whatever else is shown. Of several of one colour the
+    first has a solid line and the others are broken.
+
+    Args:
+        names: of the curves, in order: an agent's, and whatever follows a space.
+
+    Returns:
+        Colour and stroke by name. Beyond forty curves they come again.
+    """
+    names = list(names)
+    lines: dict[str, Line] = {}
+    taken: set[Line] = set()
+    for name in names:
+        own = _BY_AGENT.get(name.partition(" ")[0], SLIDE)
+        colours = (own, *(colour for colour in _COLOURS if colour != own))
+        choices = [(colour, stroke) for colour in colours for stroke in _STROKES]
+        lines[name] = next((line for line in choices if line not in taken), choices[0])
+        taken.add(lines[name])
+    return lines
 
 
 def draw_curves(
@@ -59,6 +96,7 @@ def draw_curves(
     ylabel: str,
     is_logarithmic: bool = False,
     sizes: Sequence[int] | None = None,
+    lines: Mapping[str, Line] | None = None,
 ) -> None:
     """Draw a curve with its band for each agent.
 
@@ -68,12 +106,16 @@ def draw_curves(
         ylabel: what is drawn, with its unit.
         is_logarithmic: whether its axis is.
         sizes: numbers of samples that the values belong to, instead of steps.
+        lines: colour and stroke by name, of a figure in which there are more curves
+            than here; default: as `lines_of` has them for these.
     """
+    lines = lines_of(bands) if lines is None else lines
     for name, (middle, low, high) in bands.items():
-        colour = _BY_AGENT.get(name.partition(" ")[0], SLIDE)
+        colour, stroke = lines[name]
         steps = np.arange(1, len(middle) + 1) if sizes is None else np.asarray(sizes)
         ax.fill_between(steps, low, high, color=colour, alpha=0.2, linewidth=0)
-        ax.plot(steps, middle, color=colour, linewidth=1.6, label=name)
+        look = {"color": colour, "linestyle": stroke, "linewidth": 1.6}
+        ax.plot(steps, middle, label=name, **look)
     if is_logarithmic:
         ax.set_yscale("log")
     if sizes is not None or any(len(band[0]) > _LONG for band in bands.values()):
@@ -90,7 +132,11 @@ def draw_curves(
 
 
 def plot_curves(
-    reward: Mapping[str, Band], model_error: Mapping[str, Band], *, title: str
+    reward: Mapping[str, Band],
+    model_error: Mapping[str, Band],
+    *,
+    title: str,
+    band: str = "95 % band",
 ) -> Any:
     """A figure of reward and of model error by step.
 
@@ -98,6 +144,7 @@ def plot_curves(
         reward: by agent.
         model_error: by agent [m].
         title: of the figure.
+        band: what the bands are.
 
     Returns:
         The `matplotlib.figure.Figure`.
@@ -109,7 +156,10 @@ def plot_curves(
 
     figure = new_figure((10.0, 4.6))
     left, right = figure.subplots(1, 2)
-    draw_curves(left, reward, ylabel="mean reward of a step, 95 % band")
+    # On the right some may be missing, and the others look as they do on the left.
+    lines = lines_of([*reward, *(name for name in model_error if name not in reward)])
+    label = textwrap.fill(f"mean reward of a step, {band}", _WIDEST_LABEL)
+    draw_curves(left, reward, ylabel=label, lines=lines)
     positive: dict[str, Band] = {}
     for name, (middle, low, high) in model_error.items():
         # Who knows the world errs by rounding alone, which would stretch the axis.
@@ -123,6 +173,7 @@ def plot_curves(
         positive,
         ylabel="error of foretold positions, one step [m]",
         is_logarithmic=bool(positive),
+        lines=lines,
     )
     _name_curves(figure, left)
     figure.suptitle(title)
@@ -155,10 +206,13 @@ def plot_sample_curves(
     figure = new_figure((10.0, 4.6))
     left, right = figure.subplots(1, 2)
     labels = "held-out error of position [m]", "held-out error of velocity [m/s]"
+    lines = lines_of([*position, *(name for name in velocity if name not in position)])
     for ax, bands, label in zip(
         (left, right), (position, velocity), labels, strict=True
     ):
-        draw_curves(ax, bands, ylabel=label, is_logarithmic=True, sizes=sizes)
+        draw_curves(
+            ax, bands, ylabel=label, is_logarithmic=True, sizes=sizes, lines=lines
+        )
     _name_curves(figure, left)
     figure.suptitle(title)
     return figure
@@ -171,4 +225,5 @@ def _name_curves(figure: Any, ax: Any) -> None:
         num_rows = -(-len(labels) // _MOST_IN_A_ROW)
         num_each = -(-len(labels) // num_rows)
         place = "outside lower center"
-        figure.legend(handles, labels, loc=place, ncols=num_each, frameon=False)
+        look = {"frameon": False, "handlelength": _LEGEND_LENGTH}
+        figure.legend(handles, labels, loc=place, ncols=num_each, **look)

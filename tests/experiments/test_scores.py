@@ -12,6 +12,7 @@ from boomdp_jax.experiments.run import SCHEMA
 from boomdp_jax.experiments.scores import (
     CART_MARKS,
     PUBLISHED,
+    band_name,
     check_comparable,
     load_run,
     mark_step,
@@ -140,6 +141,33 @@ def test_runs_that_differ_are_not_put_side_by_side(folders, tmp_path):
     short = write_run(tmp_path / "short", "true", [[-1.0, 0.0]])
     with pytest.raises(ValueError, match=r"expected cart of 4 steps.*got cart of 2"):
         check_comparable([loaded, load_run(short)])
+
+
+@pytest.mark.parametrize(
+    ("counts", "expected"),
+    [
+        ((5, 20), "95 % band"),
+        ((2,), "bootstrap range of few seeds"),
+        ((4, 1), "bootstrap range of few seeds"),
+        ((20, 4), "95 % band; under 5 seeds bootstrap range"),
+    ],
+)
+def test_bands_of_few_seeds_are_called_what_they_are(
+    tmp_path, monkeypatch, counts, expected
+):
+    folders = [
+        write_run(tmp_path / str(count), "physics", np.full((count, 3), -1.0))
+        for count in counts
+    ]
+    assert band_name([load_run(folder) for folder in folders]) == expected
+    pytest.importorskip("matplotlib")
+    labels = []
+    monkeypatch.setattr(
+        "matplotlib.figure.Figure.savefig",
+        lambda figure, *_, **__: labels.append(figure.axes[0].get_ylabel().split()),
+    )
+    assert cli.main(["plot", *map(str, folders)]) == 0
+    assert labels == [f"mean reward of a step, {expected}".split()]
 
 
 @pytest.mark.parametrize("options", ["", " --out new.png"])

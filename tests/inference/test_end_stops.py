@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 
 from boomdp_jax.core.history import History, make_history
+from boomdp_jax.inference.batch_blocks import blocks_of_batch
+from boomdp_jax.inference.between_stops import again_between_stops
 from boomdp_jax.inference.end_stops import end_stop_reasons, without_stops
-from boomdp_jax.inference.infer import infer
+from boomdp_jax.inference.infer import infer, infer_batch
+from boomdp_jax.inference.likelihoods import choose_likelihood
 from boomdp_jax.physics import empty_params, scene_spec_from_dict
 from boomdp_jax.physics.params import Actuator
 from tests.inference.posteriors import draws_like, make_posterior
@@ -251,6 +254,70 @@ def test_nothing_is_left_out_where_nothing_is_held_back():
     free, notes = without_stops(posterior_of("drawer"), history)
     assert free is history
     assert notes == []
+
+
+def with_velocities_at_ends(history: History) -> History:
+    """The same, of which nothing is read in full but where it comes against a stop."""
+    state, next_state = np.array(history.state), np.array(history.next_state)
+    for values in (state, next_state):
+        values[np.abs(values[:, 0, :2] @ AXIS) < 0.095, :, 3:] = np.nan
+    episode = np.asarray(history.episode)
+    return make_history(
+        state, np.asarray(history.action), next_state, DT, episode=episode
+    )
+
+
+def test_what_is_refused_between_stops_keeps_its_posterior():
+    """Which is told by its number in the batch, not by that among those with stops."""
+    stopped = recording("drawer", 3, end=0.1)
+    histories = [recording("drawer", 3, end=None), with_velocities_at_ends(stopped)]
+    histories.append(stopped)
+    chosen = choose_likelihood("open-loop", None, method="map", outliers="none")
+    again = posterior_of("drawer")
+
+    def run(key, specs, histories):
+        blocks_of_batch(specs, histories, chosen, None)
+        return [again] * len(specs)
+
+    before = [posterior_of("drawer") for _ in histories]
+    found = list(before)
+    kept = again_between_stops(run, jax.random.key(0), [SPEC] * 3, histories, found)
+    assert found[0] is before[0]
+    assert kept[:2] == histories[:2]
+    assert int(kept[2].num_transitions) == 62
+    (note,) = found[1].diagnostics["notes"]
+    assert note == (
+        "no rows are left out at stops, since those between are refused: scene: it: "
+        "likelihood 'open-loop': expected rows that start from a reading of every "
+        "pose, velocity and spin; got none; likelihood 'filtered' does without"
+    )
+    assert "38 of 100 rows are left out" in found[2].diagnostics["notes"][0]
+    assert reasons("drawer", kept[1])
+
+
+@pytest.mark.slow
+def test_where_nothing_between_stops_can_be_predicted_all_rows_are_taken():
+    """One member's lack is no fault of others; its posterior stays, and is doubted."""
+    stopped = recording("drawer", 3, end=0.1)
+    histories = [recording("drawer", 3, end=None), stopped]
+    histories.append(with_velocities_at_ends(stopped))
+    found = infer_batch(
+        jax.random.key(0),
+        [SPEC] * 3,
+        histories,
+        method="map",
+        likelihood="open-loop",
+        num_samples=10,
+    )
+    doubts = ["\n".join(posterior.diagnostics["reasons"]) for posterior in found]
+    notes = ["\n".join(posterior.diagnostics["notes"]) for posterior in found]
+    left_out = "38 of 100 rows are left out, in which it may have come"
+    refused = "expected rows that start from a reading of every pose"
+    assert [left_out in each for each in notes] == [False, True, False]
+    assert [refused in each for each in notes] == [False, False, True]
+    held = "it: is held back at the ends of the line that it goes along, as by a stop"
+    assert [held in each for each in doubts] == [False, False, True]
+    assert not found[2].diagnostics["ok"]
 
 
 @pytest.mark.slow

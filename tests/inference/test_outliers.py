@@ -1,5 +1,7 @@
 """Readings with Student-t noise, against its density, quadrature and particles."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,7 @@ import boomdp_jax
 from boomdp_jax.core.history import History, make_history
 from boomdp_jax.inference.filter_density import filter_density
 from boomdp_jax.inference.kalman import NoiseLevel, extended_filter
+from boomdp_jax.inference.likelihoods import choose_likelihood, outlier_remedy
 from boomdp_jax.inference.outliers import isolated_readings, outlier_notes
 from boomdp_jax.inference.random_motion import add_reading_noise
 from boomdp_jax.inference.robust_update import correct_robustly, scale_nodes
@@ -215,6 +218,34 @@ def test_normal_noise_gives_no_note_and_gross_errors_one():
     nothing = np.zeros((0, 1, 6))
     empty = make_history(nothing, nothing[..., :3], nothing, DT)
     assert outlier_notes(box_scene(), empty) == []
+
+
+@pytest.mark.parametrize(
+    ("likelihood", "method"),
+    [("filtered", "rj"), ("one-step", "rj"), ("open-loop", "map"), ("one-step", "svi")],
+)
+def test_what_a_note_advises_is_accepted(likelihood, method):
+    """It names all that has to be another than it was."""
+    advice = dict(re.findall(r"(\w+)='([^']+)'", outlier_remedy(likelihood, method)))
+    assert advice["outliers"] == "student-t"
+    options = {"likelihood": likelihood, "method": method, **advice}
+    assert choose_likelihood(horizon=None, **options).name == "filtered"
+
+
+@pytest.mark.parametrize("likelihood", ["one-step", "open-loop"])
+def test_the_note_of_exact_starts_names_the_likelihood_too(likelihood):
+    rng = np.random.default_rng(3)
+    history = spoilt(rng, free_box(rng, 100), 0.05)
+    found = boomdp_jax.infer(
+        jax.random.key(0),
+        box_scene(),
+        history,
+        method="map",
+        likelihood=likelihood,
+        num_samples=4,
+    )
+    (note,) = [each for each in found.diagnostics["notes"] if "lie far" in each]
+    assert note.endswith("with such, outliers='student-t' with likelihood='filtered'")
 
 
 def test_a_track_does_not_start_from_a_gross_error():
