@@ -52,7 +52,10 @@ def run(arguments: argparse.Namespace) -> None:
         spec = load_scene(arguments.scene)
         print_notes(spec.notes)
         actions = load_actions(arguments.actions, spec)
-        params = spec.with_surface(_load_params(arguments, spec))
+        params, substeps = _load_params(arguments, spec)
+        params = spec.with_surface(params)
+        if spec.substeps is None:
+            spec = dataclasses.replace(spec, substeps=substeps)
         if actions.initial_state is None:
             start, initial_state = f"{spec.source}: pose", spec.initial_state()
         else:
@@ -185,13 +188,19 @@ def read_with_noise(
     return readings_before, readings_after
 
 
-def _load_params(arguments: argparse.Namespace, spec: SceneSpec) -> Params:
-    """From the scene file, or from a draw of a posterior over the same bodies."""
+def _load_params(
+    arguments: argparse.Namespace, spec: SceneSpec
+) -> tuple[Params, int | None]:
+    """From the scene file, or from a draw of a posterior over the same bodies.
+
+    Returns:
+        The params, and in how many parts steps were made where they come from.
+    """
     if arguments.posterior is None:
         if any(spec.unknown.values()):
             print_notes([f"{spec.source}: unknown constraints are taken to be absent"])
         print_notes(_defaults(spec))
-        return spec.params()
+        return spec.params(), spec.substeps
     from boomdp_jax.inference.posterior import load_posterior
 
     posterior = load_posterior(arguments.posterior)
@@ -202,7 +211,8 @@ def _load_params(arguments: argparse.Namespace, spec: SceneSpec) -> Params:
         raise ValueError(
             f"{arguments.posterior}: --draw: expected less than {num_draws}, got {draw}"
         )
-    return jax.tree.map(lambda leaf: leaf[draw], posterior.params)
+    params = jax.tree.map(lambda leaf: leaf[draw], posterior.params)
+    return params, posterior.spec.substeps
 
 
 def _defaults(spec: SceneSpec) -> list[str]:

@@ -4,8 +4,9 @@ Each chain is a population of walkers. It starts at draws of its own from the fi
 mixture, resampled by importance, and all of its walkers then make the same cycle of
 moves as a single chain would (`moves`): jumps, local changes, walks, each accepted with
 its exact ratio. A move of all walkers of all chains of all objects is one batch of
-likelihoods. Chains share nothing, so that R-hat across them tells what importance
-weights and moves together have not evened out (Margossian et al. 2024, Nested R-hat).
+likelihoods. Chains share nothing but what their moves are fitted to, so that R-hat
+across them tells what importance weights and moves together have not evened out
+(Margossian et al. 2024, Nested R-hat).
 
 Prefer this to `structure_chain.run_chains` where a likelihood is far cheaper in a batch
 than alone.

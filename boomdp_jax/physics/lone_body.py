@@ -10,10 +10,12 @@ $$w = (s_x + r'_y\omega,\; s_y - r'_x\omega,\; \omega), \qquad
   P = (p_x,\; p_y,\; p_\omega + r_y p_x - r_x p_y).$$
 
 The pin's impulse drops out of the third balance and its constraint is $s = 0$, so
-$s = l\,(P_x, P_y)$ with l = 0 and $\omega = g\,P_\omega$ with
-$g = 1/(m\,r \cdot r' + I)$. Without a pin r = 0, l = 1/m and g = 1/I say the same of a
-free body: one code for both, no elimination of joint rows, and no softness to keep
-redundant rows solvable.
+$s = l\,(P_x, P_y)$ with l = 0 and $\omega = g\,P_\omega$. Momentum that turns with the
+body has all of its moment about the pin in whatever frame, where this balance of two
+frames has $g = 1/(m\,r \cdot r' + I)$: so $g = 1/(m\,r^2 + I)$, and in $P_\omega$
+the body's own momentum counts as $\omega/g$ and an impulse as `lone_step` says. Without
+a pin r = 0, l = 1/m and g = 1/I say the same of a free body: one code for both, no
+elimination of joint rows, and no softness to keep redundant rows solvable.
 
 The frame that is called the body's here is turned to the heading of its first wheel:
 that wheel then needs no rotation, and feet, which rub alike in every direction, never

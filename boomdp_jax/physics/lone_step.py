@@ -245,12 +245,17 @@ def _sliding(
         slide_x, slide_y = slide_x - y * spin, slide_y + x * spin
         # About the pin the whole inertia turns, whatever the frame. An impulse is
         # spread over the substep, while its lever turns: on the mean its moment is
-        # sin(a) / a of that at mid-step, and a force does the work of its way.
+        # sin(a) / a of that at mid-step, and a force does the work of its way. The half
+        # turn a is that of the mean spin, or swings would grow; friction may take up
+        # most of what the impulse gives, which so counts for half of the turn at most.
         about = body.mass * (x * x + y * y)
-        square = angle * angle
-        spread = 1.0 - square * (1.0 / 6.0) * (1.0 - square * (1.0 / 20.0))
         spread_x, spread_y = into(middle, impulse[0], impulse[1])
-        moment = moment + about * spin + spread * (y * spread_x - x * spread_y)
+        lever = y * spread_x - x * spread_y
+        kick = 0.25 * h * (impulse[2] + lever) / (body.inertia + about)
+        most = 0.5 * jnp.abs(angle)
+        square = (angle + jnp.clip(kick, -most, most)) ** 2
+        spread = 1.0 - square * (1.0 / 6.0) * (1.0 - square * (1.0 / 20.0))
+        moment = moment + about * spin + spread * lever
         inertia = inertia + about
     problem = SlidingProblem(
         push=(push_x, push_y, moment),

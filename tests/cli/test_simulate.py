@@ -1,5 +1,6 @@
 """`simulate`: recordings that follow closed forms, episode by episode."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -228,6 +229,20 @@ def test_a_start_off_a_joint_is_told(folder: Path, capsys: pytest.CaptureFixture
     _change_scene(constraints=[pin | {"anchor_b": [1, -3]}])
     _simulate()
     assert _notes(capsys) == [f"scene.json: pose: {off}"]
+
+
+@pytest.mark.parametrize(("told", "expected"), [({}, 5), ({"substeps": 3}, 3)])
+def test_a_draw_is_moved_in_the_parts_that_it_was_inferred_with(
+    folder: Path, told: dict, expected: int
+):
+    spec = dataclasses.replace(load_scene("scene.json"), substeps=5)
+    draws = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), spec.params())
+    make_posterior(spec, draws, draws).save("post.npz")
+    np.savez("a.npz", action=_action(2, (0.5, 0.2, 0.1)))
+    _change_scene(**told)
+    _simulate("--posterior post.npz")
+    origin = json.loads(str(np.load("out.npz")["params"]))
+    assert origin["scene"]["substeps"] == expected
 
 
 def test_a_posterior_of_another_outline_is_refused(

@@ -142,19 +142,23 @@ def test_fast_path_agrees_with_the_general_one(has_nuisances):
     patient = OnGeneralPath(step_of_length, NUM_LATE=(60, 60, 300), _NUM_LINES=60)
     for spread in (1.0, 4.0):
         cases = draws(spread, has_nuisances=has_nuisances)
+        is_free = ~np.asarray(cases[0].revolute.active[:, 0])
         for dt, function in ((SHORT, fast_short_step), (float(SCENE.dt), fast_step)):
             lengths = jnp.full(NUM_CASES, dt)
             usual = general_step(*cases, lengths)
             difference = worst_of_each(function(*cases), usual)
             if dt == SHORT:
-                # The general path keeps redundant rows solvable by a softness of 4e-10.
+                # The general path keeps redundant rows solvable by a softness of 4e-10,
+                # and takes a pin's lever to stand as at mid-step.
                 assert np.sum(difference > 1e-6) < 4
-                assert np.quantile(difference, 0.99) < 2e-8
+                assert np.quantile(difference, 0.99) < 2e-7
             else:
                 # Of hypotheses with four decades each way one in some hundreds is not
                 # solved by either.
                 assert np.mean(difference > 5e-5) < 0.01
-                assert np.quantile(difference, 0.9) < 2e-6
+                # Of a turn of 0.01 rad or so that is a share of the square.
+                assert np.quantile(difference, 0.9) < 1e-5
+                assert np.quantile(difference[is_free], 0.9) < 1e-12
                 solved = patient(*cases, lengths)
                 assert np.mean(worst_of_each(usual, solved) > 5e-5) < 0.005
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from boomdp_jax.physics import step
+from boomdp_jax.physics import rollout, step
 from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
 from boomdp_jax.physics.state import State
 
@@ -70,3 +70,29 @@ def test_a_push_changes_the_spin_by_what_its_turning_lever_makes_of_it(viscous):
     assert abs(error @ gained) < 5e-4 * (gained @ gained)
     assert np.sqrt(np.mean(error**2)) < 3e-3
     np.testing.assert_allclose(after[:, 2], truth[:, 0], atol=2e-3)
+
+
+@pytest.mark.parametrize("dt", [0.05, 0.1])
+@pytest.mark.parametrize("swing", [1.0, 2.5, 3.0])
+def test_swings_without_friction_neither_grow_nor_shrink_in_ten_minutes(dt, swing):
+    """A bar hung at its end, which turns by up to 0.76 rad in a step."""
+    pin = {"type": "revolute", "a": "bar", "b": "world", "anchor_b": [0.0, 0.0]}
+    pin["anchor_a"] = [0.0, 0.5]
+    shape = {"type": "box", "half_extents": [0.05, 0.5]}
+    body = {"name": "bar", "shape": shape, "density": 20.0}
+    content = {"schema": "planar-scene-1", "gravity": [0.0, -9.8], "dt": dt}
+    spec = scene_spec_from_dict(content | {"bodies": [body], "constraints": [pin]})
+    start = [0.5 * np.sin(swing), -0.5 * np.cos(swing), swing]
+    begin = State(jnp.asarray([start]), jnp.zeros((1, 3)))
+    still = jnp.zeros((round(600.0 / dt), 1, 3))
+    states, _ = jax.jit(lambda: rollout(spec.scene, spec.params(), begin, still))()
+    pose, twist = np.asarray(states.pose[:, 0]), np.asarray(states.twist[:, 0])
+    gyration = (0.05**2 + 0.5**2) / 3.0
+    speed = np.sum(twist[:, :2] ** 2, axis=1) + gyration * twist[:, 2] ** 2
+    energy = 0.5 * speed + 9.8 * (pose[:, 1] + 0.5)
+    share = energy / (9.8 * 0.5 * (1.0 - np.cos(swing)))
+    assert np.abs(share - 1.0).max() < 0.01
+    # Nor is there a drift that goes on: of the last minute the mean is that of the
+    # first one.
+    minute = round(60.0 / dt)
+    assert abs(share[-minute:].mean() - share[:minute].mean()) < 2e-3
