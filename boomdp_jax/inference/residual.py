@@ -34,6 +34,7 @@ from boomdp_jax.inference.residual_regression import (
 )
 from boomdp_jax.inference.residual_spread import SpreadGrowth, spread_growth
 from boomdp_jax.inference.sample import BlockDraws
+from boomdp_jax.inference.step_doubts import Linearised, StepError, step_error
 from boomdp_jax.inference.summary import CHANNELS
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.track_data import TrackData
@@ -79,6 +80,8 @@ class ResidualCheck(NamedTuple):
     """Of each body, whether its readings err more the faster it moves."""
     correlation: tuple[dict[str, float], ...] = ()
     """Of each body, of innovations one after the other, by the same groups."""
+    step: StepError | None = None
+    """What finer steps would change; None: it was not asked."""
 
 
 def check_residuals(targets: StructureTarget, draws: BlockDraws) -> list[ResidualCheck]:
@@ -114,8 +117,16 @@ def check_residuals(targets: StructureTarget, draws: BlockDraws) -> list[Residua
             z[place],
             noise.take(np.array([place])),
             jax.tree.map(lambda leaf, place=place: leaf[place], filtered),
+            _like_best(draws, int(index), int(best[place])),
         ).check()
     return checks
+
+
+def _like_best(draws: BlockDraws, index: int, best: int) -> np.ndarray:
+    """Coordinates of the best draw, and of all of its structure."""
+    structure = np.asarray(draws.structure)[index]
+    z = np.asarray(draws.z, float)[index]
+    return np.concatenate([z[[best]], z[structure == structure[best]]])
 
 
 class _Block:
@@ -129,9 +140,11 @@ class _Block:
         z: np.ndarray,
         noise: NoiseFit,
         filtered: Filtered,
+        others: np.ndarray,
     ):
         self._targets, self._index, self._structure = targets, index, structure
         self._z, self._noise, self._filtered = z, noise, filtered
+        self._others = others
         likelihood: Any = targets.log_likelihood
         known = (likelihood.coordinates, likelihood.data)
         coordinates, data = jax.tree.map(lambda leaf: np.asarray(leaf)[index], known)
@@ -195,7 +208,11 @@ class _Block:
         found.sort(key=lambda one: -one.fit.log_bayes_factor)
         growth = self._growth(base, counts, paths)
         white, correlated = self._whiteness(base, counts)
-        return ResidualCheck(len(rows), found, white, growth, correlated)
+        place = (self._targets, self._index, self._structure, self._z, self._filtered)
+        known_moves = (self._used, self._is_normal, base / scale, moves, scale)
+        best = Linearised(*place, self._command, *known_moves)
+        step = step_error(best, self._others)
+        return ResidualCheck(len(rows), found, white, growth, correlated, step)
 
     def _counts(self) -> np.ndarray:
         counts = self._filtered.gains.counts

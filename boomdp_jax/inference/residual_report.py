@@ -2,10 +2,14 @@
 
 import math
 
+import numpy as np
+
 from boomdp_jax.inference.evidence_report import BlockResult
+from boomdp_jax.inference.model_sites import coordinate_names
 from boomdp_jax.inference.report_table import plus_minus
 from boomdp_jax.inference.residual import BodyLaw, ResidualCheck
 from boomdp_jax.inference.residual_laws import LAWS
+from boomdp_jax.inference.step_doubts import step_reason
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 FALSE_ALARMS = 0.01
@@ -40,8 +44,9 @@ def report_residuals(
     a with a probability under a / K (Markov's inequality): with K laws of all bodies
     together, what exceeds that by a margin is a doubt. Correlated innovations without
     such a law are a note: readings of real sensors are often not white. Where they are
-    strongly correlated the draws are too sure at least, which is a doubt. A note are
-    readings that err more the faster a body moves.
+    strongly correlated the draws are too sure at least, which is a doubt, and so are
+    steps that are too long (`step_doubts`). A note are readings that err more the
+    faster a body moves.
 
     Args:
         spec: the scene.
@@ -51,8 +56,9 @@ def report_residuals(
         An entry of every block that was checked: `bodies`, `rows`, `threshold` for the
         `log_bayes_factor` of a law, the best `laws` with coefficients and their sds,
         `whiteness`, p-values by body and channel group, `correlation` of innovations
-        one after the other likewise, and `spread`, how errors grow with speed by body;
-        reasons for doubt; notes.
+        one after the other likewise, `spread`, how errors grow with speed by body, and
+        `step_shift`, by how many posterior sds numbers would move in finer steps, None
+        where it was not asked; reasons for doubt; notes.
     """
     checked = [result for result in results if result.residual is not None]
     num_bodies = sum(len(result.block.bodies) for result in checked)
@@ -63,6 +69,12 @@ def report_residuals(
         check = result.residual
         assert check is not None
         names = [spec.names[body] for body in result.block.bodies]
+        step_shift = None
+        if check.step is not None:
+            numbers = coordinate_names(tuple(names), result.block.layout)
+            too_long = step_reason(check.step, names, numbers)
+            reasons += [] if too_long is None else [too_long]
+            step_shift = float(np.max(np.abs(check.step.shift)))
         decisive: dict[int, BodyLaw] = {}
         for law in check.laws:
             if law.fit.log_bayes_factor > threshold:
@@ -122,6 +134,7 @@ def report_residuals(
                 "whiteness": whiteness,
                 "correlation": dict(zip(names, check.correlation, strict=False)),
                 "spread": spread,
+                "step_shift": step_shift,
             }
         )
     return entries, reasons, notes
