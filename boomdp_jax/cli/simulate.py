@@ -22,7 +22,7 @@ from boomdp_jax.physics.scene_file import load_scene
 from boomdp_jax.physics.scene_spec import SceneSpec
 from boomdp_jax.physics.start_gaps import start_gaps
 from boomdp_jax.physics.state import State, state_from_array
-from boomdp_jax.physics.turns import parts_for_turns
+from boomdp_jax.physics.turns import note_of_parts, parts_for_turns
 
 _NUM_CHANNELS = np.array([2, 1, 2, 1])
 """Channels of a state that share a noise scale: position, angle, velocity, spin."""
@@ -71,13 +71,7 @@ def run(arguments: argparse.Namespace) -> None:
         if spec.substeps is None:
             num_parts = parts_for_turns(after[..., 2] - before[..., 2])
             if num_parts > spec.scene.num_substeps:
-                print_notes(
-                    [
-                        f"{spec.source}: steps are made in {num_parts} parts for how "
-                        'far bodies turn in one; "substeps" there makes them in as '
-                        "many as it says"
-                    ]
-                )
+                print_notes([f"{spec.source}: {note_of_parts(num_parts)}"])
                 spec = dataclasses.replace(spec, substeps=num_parts)
                 before, after = simulate(spec.scene, params, initial_state, actions)
         _check_finite(after, spec, actions)

@@ -22,6 +22,7 @@ from boomdp_jax.inference.slot_names import slot_names
 from boomdp_jax.physics.constraint_spec import JOINTS, KINDS
 from boomdp_jax.physics.params import WORLD, Params, empty_params
 from boomdp_jax.physics.scene_spec import SceneSpec
+from boomdp_jax.physics.turns import note_of_parts
 
 NUM_PRIOR_DRAWS = 4096
 """Prior draws that a posterior carries, to judge what was identified."""
@@ -132,10 +133,7 @@ def _as_stepped(
         num_parts = max(num_parts, likelihood.coordinates.scene.num_substeps)
     if spec.substeps is not None or num_parts == spec.scene.num_substeps:
         return spec, []
-    note = (
-        f"steps are made in {num_parts} parts for how far bodies turn in one, in "
-        f'predictions too; "substeps" in the scene makes them in as many as it says'
-    )
+    note = f"{note_of_parts(num_parts)}; predictions are made so too"
     return dataclasses.replace(spec, substeps=num_parts), [note]
 
 

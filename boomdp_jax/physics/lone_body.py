@@ -58,6 +58,10 @@ class Pivot(NamedTuple):
     """One if it is inactive, else zero."""
     levelling: FloatScalar
     """Turn that puts right an anchor off by one metre at a lever of one [rad/m²]."""
+    inertia: FloatScalar
+    """1/g: about the pin, or about the centre of mass if it is inactive [kg m²]."""
+    ease: FloatScalar
+    """Its inverse."""
 
 
 class LoneBody(NamedTuple):
@@ -125,15 +129,17 @@ def lone_body(
         on = pin.active * mobile
         anchor = (on * pin.anchor_a[0], on * pin.anchor_a[1])
         turned_anchor = into(axis, *anchor)
-        square = anchor[0] ** 2 + anchor[1] ** 2
-        levelling = on * mass / (mass * square + inertia)
+        whole = inertia + mass * (anchor[0] ** 2 + anchor[1] ** 2)
+        ease_of_spin = 1.0 / whole
         pivot = Pivot(
             active=pin.active,
             anchor=turned_anchor,
             world=pin.anchor_b,
             place=(on * pin.anchor_b[0], on * pin.anchor_b[1]),
             free=1.0 - on,
-            levelling=levelling,
+            levelling=on * mass * ease_of_spin,
+            inertia=whole,
+            ease=ease_of_spin,
         )
         ease = (1.0 - on) * ease
     parts = [] if contacts is None else _parts(contacts)

@@ -237,9 +237,8 @@ def _sliding(
     middle = out_of(start, *half)
     px, py = body.mass * vx + impulse[0], body.mass * vy + impulse[1]
     push_x, push_y = into(middle, px, py)
-    moment = body.inertia * spin + impulse[2]
     slide_x, slide_y = into(start, vx, vy)
-    inertia = body.inertia
+    inertia, moment = body.inertia, impulse[2]
     if body.pivot is not None:
         x, y = body.pivot.anchor
         slide_x, slide_y = slide_x - y * spin, slide_y + x * spin
@@ -248,17 +247,16 @@ def _sliding(
         # sin(a) / a of that at mid-step, and a force does the work of its way. The half
         # turn a is that of the mean spin, or swings would grow; friction may take up
         # most of what the impulse gives, which so counts for half of the turn at most.
-        about = body.mass * (x * x + y * y)
+        inertia = body.pivot.inertia
         spread_x, spread_y = into(middle, impulse[0], impulse[1])
         lever = y * spread_x - x * spread_y
-        kick = 0.25 * h * (impulse[2] + lever) / (body.inertia + about)
+        kick = 0.25 * h * body.pivot.ease * (moment + lever)
         most = 0.5 * jnp.abs(angle)
         square = (angle + jnp.clip(kick, -most, most)) ** 2
         spread = 1.0 - square * (1.0 / 6.0) * (1.0 - square * (1.0 / 20.0))
-        moment = moment + about * spin + spread * lever
-        inertia = inertia + about
+        moment = moment + spread * lever
     problem = SlidingProblem(
-        push=(push_x, push_y, moment),
+        push=(push_x, push_y, inertia * spin + moment),
         start=(slide_x, slide_y, spin),
         ease=(body.ease, inertia),
         turn=half,

@@ -33,3 +33,15 @@ def parts_for_turns(turns: np.ndarray) -> int:
     if most < _LEAST_TURN:
         return 1
     return min(1 << int(np.ceil(np.log2(most / _TURN_OF_PART))), _MOST_PARTS)
+
+
+def note_of_parts(num_parts: int) -> str:
+    """That steps are cut for how far bodies turn, and how to say otherwise.
+
+    Args:
+        num_parts: in how many parts they are made.
+    """
+    return (
+        f"steps are made in {num_parts} parts for how far bodies turn in one; "
+        '"substeps" in the scene makes them in as many as it says'
+    )
