@@ -21,6 +21,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from boomdp_jax.inference.periods import wrapped
+
 # Draws of a group from which its spread is taken.
 _LEAST_GROUP = 4
 # Parts of a group, each moved by what the others say, and how many of these there have
@@ -202,15 +204,3 @@ def _mean(values: np.ndarray, period: np.ndarray) -> np.ndarray:
     sine, cosine = np.sin(turn * values), np.cos(turn * values)
     angle = np.arctan2(sine.mean(axis=0), cosine.mean(axis=0))
     return np.where(period > 0, angle / turn, values.mean(axis=0))
-
-
-def wrapped(values: np.ndarray, period: np.ndarray) -> np.ndarray:
-    """Numbers with a period brought into half of it about zero.
-
-    Args:
-        values: `[*any, number]`.
-        period: of each number; zero: it has none, and stays.
-    """
-    length = np.where(period > 0, period, 1.0)
-    turned = values - length * np.floor(values / length + 0.5)
-    return np.where(period > 0, turned, values)

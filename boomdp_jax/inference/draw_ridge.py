@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from boomdp_jax.inference.draw_moves import wrapped
+from boomdp_jax.inference.periods import wrapped
 
 # Draws for each number of the regression, below which it has fewer numbers.
 _FOR_EACH = 4

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from boomdp_jax.inference.block import Block
+from boomdp_jax.inference.block_draws import BlockDraws
 from boomdp_jax.inference.fixed_structure import structure_of_slots
 from boomdp_jax.inference.residual import ResidualCheck
-from boomdp_jax.inference.sample import BlockDraws
 from boomdp_jax.physics.params import WORLD
 from boomdp_jax.physics.scene_spec import SceneSpec
 

@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from boomdp_jax.core.arrays import on_device
-from boomdp_jax.inference.draw_moves import wrapped
 from boomdp_jax.inference.evaluate import evaluate_points
 from boomdp_jax.inference.fit_groups import FitGroups
 from boomdp_jax.inference.one_step import NOISE_SHAPE
+from boomdp_jax.inference.periods import wrapped
 from boomdp_jax.inference.target import StructureTarget
 
 _GROUP = np.array([0, 0, 1, 2, 2, 3])

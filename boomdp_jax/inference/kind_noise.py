@@ -4,12 +4,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from boomdp_jax.inference.block_draws import BlockDraws
 from boomdp_jax.inference.evaluate import log_prior_density
 from boomdp_jax.inference.kind_objects import ObjectsAlone
 from boomdp_jax.inference.noise_correction import noise_about_peaks
 from boomdp_jax.inference.noise_level import NoiseFit, prior_noise
 from boomdp_jax.inference.residual import ResidualCheck, check_residuals
-from boomdp_jax.inference.sample import BlockDraws
 
 
 class OwnOfBody(NamedTuple):

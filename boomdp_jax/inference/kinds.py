@@ -16,6 +16,7 @@ from boomdp_jax.core.history import History
 from boomdp_jax.core.versions import library_versions
 from boomdp_jax.inference.arguments import check_arguments
 from boomdp_jax.inference.assemble import assemble_posterior
+from boomdp_jax.inference.block_draws import BlockDraws
 from boomdp_jax.inference.chain_diagnostics import diagnose_chains
 from boomdp_jax.inference.contact_numbers import untouched_notes
 from boomdp_jax.inference.coordinates import Coordinates
@@ -50,7 +51,6 @@ from boomdp_jax.inference.kinds_verdict import (
 )
 from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.inference.posterior import Posterior
-from boomdp_jax.inference.sample import BlockDraws
 from boomdp_jax.inference.structure_chain import ChainDraws
 from boomdp_jax.inference.structure_draws import SampleSettings
 from boomdp_jax.physics.scene_spec import SceneSpec

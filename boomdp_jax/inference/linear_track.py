@@ -20,13 +20,13 @@ import numpy as np
 from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.core.spread import Program, run_each
 from boomdp_jax.inference.chunking import CHUNK_SIZE
-from boomdp_jax.inference.draw_moves import wrapped
 from boomdp_jax.inference.evaluate import single_steps
 from boomdp_jax.inference.filter_points import filter_points
 from boomdp_jax.inference.filtered_likelihood import CHANNEL_GROUPS
 from boomdp_jax.inference.fit import Host
 from boomdp_jax.inference.kalman import Filtered, channel_scale, kick_scale, start_scale
 from boomdp_jax.inference.noise_level import NoiseFit
+from boomdp_jax.inference.periods import wrapped
 from boomdp_jax.inference.target import StructureTarget
 from boomdp_jax.inference.track_data import TrackData, TrackRow
 from boomdp_jax.inference.tracking import channel_difference

@@ -23,13 +23,13 @@ too small.
 
 import numpy as np
 
-from boomdp_jax.inference.draw_moves import wrapped
 from boomdp_jax.inference.draw_ridge import DrawRidge
 from boomdp_jax.inference.fit import Fits, Host, climb, normal_equations
 from boomdp_jax.inference.noise_expansion import Laplace, NoiseExpansion
 from boomdp_jax.inference.noise_level import NoiseFit
 from boomdp_jax.inference.noise_proposal import NoiseProposal, best_of_groups
 from boomdp_jax.inference.noise_regression import NoiseRegression
+from boomdp_jax.inference.periods import wrapped
 from boomdp_jax.inference.target import StructureTarget
 
 # Iterations to the peak under fixed gains.

@@ -30,8 +30,9 @@ from boomdp_jax.inference.block import Block
 from boomdp_jax.inference.contact_prediction import ContactScene, predict_step
 from boomdp_jax.inference.fixed_structure import Structure, structure_blocks
 from boomdp_jax.inference.model_sites import Site, block_sites
-from boomdp_jax.inference.one_step import NOISE_SHAPE, Readings, in_effect, readings
+from boomdp_jax.inference.one_step import NOISE_SHAPE
 from boomdp_jax.inference.prior import NOISE_GROUPS
+from boomdp_jax.inference.single_steps import Readings, in_effect, readings
 from boomdp_jax.inference.slot_names import known_numbers, physical_numbers
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene

@@ -17,6 +17,7 @@ from boomdp_jax.core.arrays import Key
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.assemble import assemble_posterior
 from boomdp_jax.inference.block import Block, make_block
+from boomdp_jax.inference.block_draws import BlockDraws
 from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics
 from boomdp_jax.inference.components import independent_blocks
 from boomdp_jax.inference.evidence_report import BlockResult
@@ -29,7 +30,6 @@ from boomdp_jax.inference.fixed_structure import (
 )
 from boomdp_jax.inference.numpyro_model import model_of_blocks
 from boomdp_jax.inference.posterior import Posterior, with_diagnostics
-from boomdp_jax.inference.sample import BlockDraws
 from boomdp_jax.inference.touching import find_touching
 from boomdp_jax.physics.params import WORLD
 from boomdp_jax.physics.scene_spec import SceneSpec

@@ -4,11 +4,11 @@ import math
 
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.block import Block, make_block, stack_blocks
+from boomdp_jax.inference.block_draws import BlockDraws
 from boomdp_jax.inference.online_fit import RefitSettings, in_coordinates_of
 from boomdp_jax.inference.online_state import BlockBelief
 from boomdp_jax.inference.online_window import windowed
 from boomdp_jax.inference.residual import ResidualCheck, check_residuals
-from boomdp_jax.inference.sample import BlockDraws
 
 # Rows that count less than this by forgetting may be of another object. Those that
 # count for little are asked as well: of a slow change recent ones alone show nothing,

@@ -10,6 +10,7 @@ import numpy as np
 from boomdp_jax.core.arrays import Key, on_device
 from boomdp_jax.inference.assemble import assemble_posterior, merge_params
 from boomdp_jax.inference.block import Block
+from boomdp_jax.inference.block_draws import BlockDraws
 from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics
 from boomdp_jax.inference.contact_numbers import untouched_notes, with_contact_numbers
 from boomdp_jax.inference.decode import decode
@@ -23,7 +24,6 @@ from boomdp_jax.inference.online_state import BlockBelief
 from boomdp_jax.inference.posterior import Posterior
 from boomdp_jax.inference.resampling import systematic
 from boomdp_jax.inference.residual import ResidualCheck
-from boomdp_jax.inference.sample import BlockDraws
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene_spec import SceneSpec
 

@@ -19,7 +19,8 @@ from boomdp_jax.core.arrays import FloatScalar, IntScalar, Key
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.block import Block, make_block
 from boomdp_jax.inference.coordinates import Coordinates
-from boomdp_jax.inference.one_step import Readings, readings, residuals
+from boomdp_jax.inference.one_step import residuals
+from boomdp_jax.inference.single_steps import Readings, readings
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene_spec import SceneSpec
 

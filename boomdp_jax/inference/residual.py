@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from boomdp_jax.inference.block_draws import BlockDraws
 from boomdp_jax.inference.body_numbers import get_number
 from boomdp_jax.inference.decode import decode
 from boomdp_jax.inference.evaluate import pushed_innovations
@@ -33,7 +34,6 @@ from boomdp_jax.inference.residual_regression import (
     whiteness,
 )
 from boomdp_jax.inference.residual_spread import SpreadGrowth, spread_growth
-from boomdp_jax.inference.sample import BlockDraws
 from boomdp_jax.inference.step_doubts import Linearised, StepError, step_error
 from boomdp_jax.inference.summary import CHANNELS
 from boomdp_jax.inference.target import StructureTarget

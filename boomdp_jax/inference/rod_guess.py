@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.full_precision import full_precision
-from boomdp_jax.inference.one_step import Readings
+from boomdp_jax.inference.single_steps import Readings
 from boomdp_jax.physics.params import WORLD
 
 # Places to start from, the same ones always, and iterations from each.

@@ -1,7 +1,7 @@
 """From targets to draws: fit, draw by one of several methods, check."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from boomdp_jax.core.arrays import Key, on_device
 from boomdp_jax.core.spread import is_spread
+from boomdp_jax.inference.block_draws import BlockDraws
 from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics, diagnose_chains
 from boomdp_jax.inference.compile_ahead import CompileAhead, signature
 from boomdp_jax.inference.enumerate_structures import enumerate_structures
@@ -48,29 +49,6 @@ from boomdp_jax.inference.weighing import evaluate_each
 
 # Importance sampling is heard only with as many effective draws.
 _MIN_SAMPLE_SIZE = 100.0
-
-
-class BlockDraws(NamedTuple):
-    """What sampling a batch of equal blocks gives; leading axis `object`, on the host.
-
-    `[object, draw, ...]` unless a field says otherwise.
-    """
-
-    structure: np.ndarray
-    z: np.ndarray
-    """`[object, draw, dim]`."""
-    log_density: np.ndarray
-    noise_scale: np.ndarray
-    """Of readings, `[object, draw, body, 4]`."""
-    impulse_scale: np.ndarray | None
-    """Of the motion, `[object, draw, body, 2]`; None where it is taken as exact."""
-    log_evidence: np.ndarray
-    """`[object]`."""
-    evidence: StructureEvidence | None
-    """Of every structure; None where the method gives none."""
-    diagnostics: list[ChainDiagnostics]
-    chain_index: np.ndarray
-    """Index of each chain; draws lie chain after chain."""
 
 
 def sample_blocks(

@@ -8,8 +8,8 @@ from boomdp_jax.core.full_precision import full_precision
 from boomdp_jax.inference.coordinates import Coordinates
 from boomdp_jax.inference.layout import BODY_NUMBERS, SlotKey
 from boomdp_jax.inference.meeting import anchor_scale, met_at, rod_length
-from boomdp_jax.inference.one_step import Readings
 from boomdp_jax.inference.rod_guess import rod_guess
+from boomdp_jax.inference.single_steps import Readings
 from boomdp_jax.physics.params import WORLD
 
 # Distances [m] and speeds [m/s] that weigh the same in a guess: what a camera resolves.

@@ -9,8 +9,8 @@ from jaxtyping import Array, Bool, Float
 
 from boomdp_jax.core.arrays import on_device
 from boomdp_jax.core.history import History
-from boomdp_jax.inference.one_step import Readings, in_effect, readings
 from boomdp_jax.inference.outliers import without_isolated
+from boomdp_jax.inference.single_steps import Readings, in_effect, readings
 from boomdp_jax.physics.params import Params
 
 

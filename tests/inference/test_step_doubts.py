@@ -9,11 +9,11 @@ import pytest
 
 from boomdp_jax.core.history import History, make_history
 from boomdp_jax.inference.block import make_block, stack_blocks
+from boomdp_jax.inference.block_draws import BlockDraws
 from boomdp_jax.inference.filtered_likelihood import FilteredLikelihood
 from boomdp_jax.inference.infer import infer
 from boomdp_jax.inference.online import OnlineBelief
 from boomdp_jax.inference.residual import ResidualCheck, check_residuals
-from boomdp_jax.inference.sample import BlockDraws
 from boomdp_jax.inference.step_doubts import StepError, step_reason
 from boomdp_jax.physics import scene_spec_from_dict, state_from_array, step
 from boomdp_jax.physics.scene_spec import SceneSpec
