@@ -9,18 +9,18 @@ import numpy as np
 from numpyro.diagnostics import effective_sample_size
 
 from boomdp_jax.core.history import History
-from boomdp_jax.inference.adapt_mixture import adapt_mixtures
-from boomdp_jax.inference.block import make_block, stack_blocks
-from boomdp_jax.inference.find_modes import find_modes
-from boomdp_jax.inference.fit import FitSettings
-from boomdp_jax.inference.laplace_mixture import LaplaceMixture, make_mixture
-from boomdp_jax.inference.mixture_building import laplace_mixture
-from boomdp_jax.inference.moves import MOVES
-from boomdp_jax.inference.noise import host_generator
-from boomdp_jax.inference.structure_chain import ChainSettings, run_chains
-from boomdp_jax.inference.structure_draws import start_mixtures
-from boomdp_jax.inference.target import StructureTarget
-from boomdp_jax.inference.weighing import evaluate_each
+from boomdp_jax.core.random_numbers import host_generator
+from boomdp_jax.inference.blocks.block import make_block, stack_blocks
+from boomdp_jax.inference.fits.find_modes import find_modes
+from boomdp_jax.inference.fits.fit import FitSettings
+from boomdp_jax.inference.likelihoods.target import StructureTarget
+from boomdp_jax.inference.samplers.adapt_mixture import adapt_mixtures
+from boomdp_jax.inference.samplers.laplace_mixture import LaplaceMixture, make_mixture
+from boomdp_jax.inference.samplers.mixture_building import laplace_mixture
+from boomdp_jax.inference.samplers.moves import MOVES
+from boomdp_jax.inference.samplers.structure_chain import ChainSettings, run_chains
+from boomdp_jax.inference.samplers.structure_draws import start_mixtures
+from boomdp_jax.inference.samplers.weighing import evaluate_each
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 PROPOSALS = ("births from the prior", "one fit of each structure", "adapted mixture")

@@ -8,8 +8,8 @@ import numpy as np
 from _plain_samplers import PlainResult, as_posterior
 
 from boomdp_jax.core.history import History
-from boomdp_jax.inference.one_step import residuals
-from boomdp_jax.inference.plain_problem import plain_problem
+from boomdp_jax.inference.likelihoods.one_step import residuals
+from boomdp_jax.inference.samplers.plain_problem import plain_problem
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 # Differences from the readings enter as they are below this, beyond it by logarithms:

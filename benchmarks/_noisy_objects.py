@@ -14,10 +14,10 @@ import numpy as np
 from _information import PRIOR_SD, free_numbers
 
 from boomdp_jax.core.transition_table import TransitionTable
-from boomdp_jax.inference.kalman import NoiseLevel, extended_filter
-from boomdp_jax.inference.summary import axial_difference
-from boomdp_jax.inference.track_data import TrackData, track_data
-from boomdp_jax.inference.tracking import Gains, innovations, one_step_gains
+from boomdp_jax.inference.likelihoods.kalman import NoiseLevel, extended_filter
+from boomdp_jax.inference.likelihoods.tracking import Gains, innovations, one_step_gains
+from boomdp_jax.inference.posteriors.summary import axial_difference
+from boomdp_jax.inference.readings.track_data import TrackData, track_data
 from boomdp_jax.interop.object_families import random_object, record_random_pushes
 from boomdp_jax.interop.recording import with_reading_noise
 from boomdp_jax.physics import Params, Scene, State, step

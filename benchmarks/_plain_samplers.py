@@ -12,14 +12,14 @@ import numpy as np
 
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.assemble import assemble_posterior
-from boomdp_jax.inference.block import Block
-from boomdp_jax.inference.block_draws import BlockDraws
-from boomdp_jax.inference.chain_diagnostics import diagnose_chains
-from boomdp_jax.inference.evidence_report import BlockResult
-from boomdp_jax.inference.plain_metropolis import plain_metropolis
-from boomdp_jax.inference.plain_problem import PlainProblem, plain_problem
-from boomdp_jax.inference.posterior import Posterior
-from boomdp_jax.inference.structure_chain import ChainDraws
+from boomdp_jax.inference.blocks.block import Block
+from boomdp_jax.inference.doubts.evidence_report import BlockResult
+from boomdp_jax.inference.posteriors.posterior import Posterior
+from boomdp_jax.inference.samplers.block_draws import BlockDraws
+from boomdp_jax.inference.samplers.chain_diagnostics import diagnose_chains
+from boomdp_jax.inference.samplers.plain_metropolis import plain_metropolis
+from boomdp_jax.inference.samplers.plain_problem import PlainProblem, plain_problem
+from boomdp_jax.inference.samplers.structure_chain import ChainDraws
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 # Steps of the SMC's random walks, of what is best for a normal density.

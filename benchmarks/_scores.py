@@ -10,14 +10,14 @@ import dataclasses
 import jax
 import numpy as np
 
-from boomdp_jax.inference.posterior import Posterior
-from boomdp_jax.inference.structure_report import (
+from boomdp_jax.inference.posteriors.posterior import Posterior
+from boomdp_jax.inference.posteriors.structure_report import (
     Slots,
     axle_offsets,
     constraint_draws,
     group_by_structure,
 )
-from boomdp_jax.inference.summary import axial_difference, weighted_quantiles
+from boomdp_jax.inference.posteriors.summary import axial_difference, weighted_quantiles
 from boomdp_jax.physics.params import WORLD, Params
 from boomdp_jax.physics.scene_spec import SceneSpec
 

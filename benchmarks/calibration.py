@@ -19,15 +19,15 @@ import jax.numpy as jnp
 import numpy as np
 from _report import Reporter, parser_of
 
-from boomdp_jax.inference.evaluate import evaluate_points, log_prior_density
-from boomdp_jax.inference.find_modes import find_single_step_modes
-from boomdp_jax.inference.fit import FitSettings, Modes
-from boomdp_jax.inference.importance_evidence import draws_of_noise
-from boomdp_jax.inference.noise import host_generator
+from boomdp_jax.core.random_numbers import host_generator
+from boomdp_jax.inference.fits.find_modes import find_single_step_modes
+from boomdp_jax.inference.fits.fit import FitSettings, Modes
+from boomdp_jax.inference.likelihoods.evaluate import evaluate_points, log_prior_density
+from boomdp_jax.inference.likelihoods.target import StructureTarget
 from boomdp_jax.inference.sample import SAMPLERS
-from boomdp_jax.inference.structure_draws import SampleSettings, start_mixtures
-from boomdp_jax.inference.target import StructureTarget
-from boomdp_jax.inference.weighing import batch_noise, evaluate_each
+from boomdp_jax.inference.samplers.importance_evidence import draws_of_noise
+from boomdp_jax.inference.samplers.structure_draws import SampleSettings, start_mixtures
+from boomdp_jax.inference.samplers.weighing import batch_noise, evaluate_each
 from tests.inference.prior_objects import PriorObjects, draw_objects
 from tests.reference.ranks import rank, thin, uniformity
 

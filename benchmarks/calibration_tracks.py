@@ -18,11 +18,15 @@ import jax
 import numpy as np
 from _report import Reporter, parser_of
 
-from boomdp_jax.inference.evaluate import log_prior_density
-from boomdp_jax.inference.filter_points import filter_densities
-from boomdp_jax.inference.noise_level import NoiseFit, log_noise_prior, prior_noise
+from boomdp_jax.inference.hypotheses.noise_level import (
+    NoiseFit,
+    log_noise_prior,
+    prior_noise,
+)
+from boomdp_jax.inference.likelihoods.evaluate import log_prior_density
+from boomdp_jax.inference.likelihoods.filter_points import filter_densities
 from boomdp_jax.inference.sample import sample_blocks
-from boomdp_jax.inference.structure_draws import SampleSettings
+from boomdp_jax.inference.samplers.structure_draws import SampleSettings
 from tests.inference.prior_objects import PriorTracks, draw_tracks
 from tests.reference.ranks import rank, thin, uniformity
 

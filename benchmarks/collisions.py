@@ -29,10 +29,10 @@ from _two_discs import (
 
 import boomdp_jax
 from boomdp_jax.core import History, make_history
-from boomdp_jax.inference.block import make_block
-from boomdp_jax.inference.filter_density import filter_density
-from boomdp_jax.inference.kalman import NoiseLevel
-from boomdp_jax.inference.touching import find_touching
+from boomdp_jax.inference.blocks.block import make_block
+from boomdp_jax.inference.likelihoods.filter_density import filter_density
+from boomdp_jax.inference.likelihoods.kalman import NoiseLevel
+from boomdp_jax.inference.readings.touching import find_touching
 from boomdp_jax.physics import SceneSpec, scene_spec_from_dict
 
 NAMES = ("log mass ratio", "restitution", "log friction")

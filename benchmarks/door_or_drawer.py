@@ -28,7 +28,7 @@ from _report import Reporter, parser_of
 
 from boomdp_jax.core.atomic import atomic_write
 from boomdp_jax.inference.infer import infer_batch
-from boomdp_jax.inference.summary import axial_difference
+from boomdp_jax.inference.posteriors.summary import axial_difference
 
 JOINTS = tuple(KINDS.values())
 STOPPED = "may have come against a stop"

@@ -29,10 +29,10 @@ from numpyro.diagnostics import effective_sample_size
 from structure_recovery import make_objects
 
 from boomdp_jax.core.history import History
-from boomdp_jax.inference import evaluate, filter_points
-from boomdp_jax.inference.chunking import CHUNK_SIZE
 from boomdp_jax.inference.infer import infer
-from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.likelihoods import evaluate, filter_points
+from boomdp_jax.inference.likelihoods.chunking import CHUNK_SIZE
+from boomdp_jax.inference.posteriors.posterior import Posterior
 from boomdp_jax.interop.object_families import FAMILIES, hide
 from boomdp_jax.interop.recording import READING_NOISE, with_reading_noise
 from boomdp_jax.physics.scene_spec import SceneSpec

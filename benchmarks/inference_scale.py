@@ -15,7 +15,7 @@ from _report import Reporter, parser_of
 
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.infer import infer_batch
-from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.posteriors.posterior import Posterior
 from boomdp_jax.interop.object_families import (
     hide,
     random_object,

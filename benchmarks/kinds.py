@@ -19,12 +19,12 @@ import numpy as np
 from _kind_scenes import KINDS, NOISE, Room, draw_pushes, make_room, predict, run
 from _report import Reporter, parser_of
 
-from boomdp_jax.inference.kind_chains import KindSettings
-from boomdp_jax.inference.kind_objects import sample_alone
-from boomdp_jax.inference.kind_prior import KindPrior
-from boomdp_jax.inference.kinds import infer_kinds_of
-from boomdp_jax.inference.kinds_posterior import KindsPosterior
-from boomdp_jax.inference.structure_draws import SampleSettings
+from boomdp_jax.inference.kinds.chains import KindSettings
+from boomdp_jax.inference.kinds.infer_kinds import infer_kinds_of
+from boomdp_jax.inference.kinds.objects import sample_alone
+from boomdp_jax.inference.kinds.posterior import KindsPosterior
+from boomdp_jax.inference.kinds.prior import KindPrior
+from boomdp_jax.inference.samplers.structure_draws import SampleSettings
 
 HORIZONS = (5, 20)
 """Steps ahead, of 40 ms."""

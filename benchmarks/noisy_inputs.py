@@ -22,15 +22,15 @@ from _noisy_objects import (
 )
 from _report import Reporter, parser_of
 
-from boomdp_jax.inference.block import make_block, stack_blocks
-from boomdp_jax.inference.evaluate import evaluate_points, log_prior_density
-from boomdp_jax.inference.filter_points import filter_densities
+from boomdp_jax.inference.blocks.block import make_block, stack_blocks
+from boomdp_jax.inference.hypotheses.noise_level import NoiseFit
 from boomdp_jax.inference.infer import infer_batch
-from boomdp_jax.inference.noise_level import NoiseFit
-from boomdp_jax.inference.one_step import OneStepLikelihood
-from boomdp_jax.inference.posterior import Posterior
-from boomdp_jax.inference.structure_report import Slots, group_by_structure
-from boomdp_jax.inference.summary import weighted_quantiles
+from boomdp_jax.inference.likelihoods.evaluate import evaluate_points, log_prior_density
+from boomdp_jax.inference.likelihoods.filter_points import filter_densities
+from boomdp_jax.inference.likelihoods.one_step import OneStepLikelihood
+from boomdp_jax.inference.posteriors.posterior import Posterior
+from boomdp_jax.inference.posteriors.structure_report import Slots, group_by_structure
+from boomdp_jax.inference.posteriors.summary import weighted_quantiles
 from boomdp_jax.interop.object_families import hide
 from boomdp_jax.physics.params import WORLD
 

@@ -19,7 +19,7 @@ from _report import Reporter, parser_of
 import boomdp_jax
 from boomdp_jax.core.history import make_history
 from boomdp_jax.inference import OnlineBelief
-from boomdp_jax.inference.online_likelihood import track_points
+from boomdp_jax.inference.online.likelihood import track_points
 from boomdp_jax.physics.state import state_from_array
 
 TARGET_SECONDS = 0.05

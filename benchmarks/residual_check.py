@@ -16,9 +16,9 @@ from _noisy_objects import make_noisy_object
 from _report import Reporter, parser_of
 
 from boomdp_jax.core.history import make_history
+from boomdp_jax.inference.doubts.residual_report import FALSE_ALARMS
 from boomdp_jax.inference.infer import infer_batch
-from boomdp_jax.inference.posterior import Posterior
-from boomdp_jax.inference.residual_report import FALSE_ALARMS
+from boomdp_jax.inference.posteriors.posterior import Posterior
 from boomdp_jax.interop.object_families import FAMILIES, hide
 from tests.inference import residual_worlds as worlds
 from tests.inference.recordings import DT, box_scene

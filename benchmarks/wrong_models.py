@@ -27,7 +27,7 @@ from boomdp_jax.envs import CART_WORLDS, Cart
 from boomdp_jax.experiments import agent_of
 from boomdp_jax.experiments.scores import CART_MARKS, mark_step
 from boomdp_jax.inference import infer_batch
-from boomdp_jax.inference.residual import FEWEST_ROWS
+from boomdp_jax.inference.doubts.residual import FEWEST_ROWS
 from boomdp_jax.models import AbstractModel
 from boomdp_jax.physics import State, state_from_array
 from boomdp_jax.planning import Belief

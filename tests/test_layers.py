@@ -29,6 +29,13 @@ LAYERS = {
 ALLOWED = {("cli", "experiments"), ("cli", "interop"), ("cli", "viz")}
 # A posterior's `plot` and `to_arviz` are doors to packages above, opened when called.
 ALLOWED_WHEN_CALLED = {("inference", "viz"), ("inference", "interop")}
+# Inside `inference` too a folder, or a file that stands by itself, imports only what
+# comes before it.
+INFERENCE = ["members", "arguments", "progress_bar"]
+INFERENCE += ["hypotheses", "readings", "likelihoods", "blocks", "fits", "samplers"]
+INFERENCE += ["noise", "posteriors", "failures", "doubts", "assemble", "sample"]
+INFERENCE += ["under_numpyro", "between_stops", "batch_blocks", "infer", "pushes"]
+INFERENCE += ["kinds", "online", "sweeps"]
 OWNERS = {"brax": "interop", "mujoco": "interop", "arviz": "interop"}
 OWNERS |= {"matplotlib": "viz", "ray": "interop", "mctx": "planning"}
 OWNERS |= {"ompl": "interop"}
@@ -106,6 +113,21 @@ def test_file_imports_only_lower_layers(path):
             is_deferred and (me, other) in ALLOWED_WHEN_CALLED
         )
         assert LAYERS[other] < LAYERS[me] or is_allowed, f"{path} imports {name}"
+
+
+@pytest.mark.parametrize(
+    "path", [path for path in MODULES if owner(path) == "inference"], ids=name_of
+)
+def test_file_of_inference_imports_only_what_comes_before_it(path):
+    mine = path.relative_to(PACKAGE / "inference").parts[0].removesuffix(".py")
+    if mine == "__init__":
+        return
+    for name, _ in imports(path):
+        if name.startswith("boomdp_jax.inference."):
+            other = name.split(".")[2]
+            assert other in INFERENCE, f"{path} imports {name}: name its own module"
+            is_before = INFERENCE.index(other) <= INFERENCE.index(mine)
+            assert is_before, f"{path} imports {name}"
 
 
 @pytest.mark.parametrize("path", MODULES, ids=name_of)

@@ -11,28 +11,34 @@ import pytest
 
 from boomdp_jax import models, planning
 from boomdp_jax.core import make_history
-from boomdp_jax.inference import moves, nuts_chains, online_moves, svi
-from boomdp_jax.inference.block import make_block
-from boomdp_jax.inference.filter_density import filter_density
-from boomdp_jax.inference.fit import Modes
-from boomdp_jax.inference.kalman import extended_filter
-from boomdp_jax.inference.noise import draw_noise
-from boomdp_jax.inference.numpyro_model import make_model
-from boomdp_jax.inference.one_step import OneStepLikelihood
-from boomdp_jax.inference.prior import NOISE_GROUPS
-from boomdp_jax.inference.reading_law import ReadingLaw, law_after, log_likelihood
-from boomdp_jax.inference.seeds import seed_coordinates
-from boomdp_jax.inference.slot_conditional import sample_slot, slot_log_density
-from boomdp_jax.inference.track_data import track_data
-from boomdp_jax.inference.tracking import innovations
+from boomdp_jax.core.random_numbers import draw_noise
+from boomdp_jax.inference.blocks.block import make_block
+from boomdp_jax.inference.fits.fit import Modes
+from boomdp_jax.inference.fits.seeds import seed_coordinates
+from boomdp_jax.inference.hypotheses.prior import NOISE_GROUPS
+from boomdp_jax.inference.likelihoods.filter_density import filter_density
+from boomdp_jax.inference.likelihoods.kalman import extended_filter
+from boomdp_jax.inference.likelihoods.one_step import OneStepLikelihood
+from boomdp_jax.inference.likelihoods.tracking import innovations
+from boomdp_jax.inference.online import moves as online_moves
+from boomdp_jax.inference.pushes.reading_law import (
+    ReadingLaw,
+    law_after,
+    log_likelihood,
+)
+from boomdp_jax.inference.readings.track_data import track_data
+from boomdp_jax.inference.samplers import moves
+from boomdp_jax.inference.samplers.slot_conditional import sample_slot, slot_log_density
+from boomdp_jax.inference.under_numpyro import nuts_chains, svi
+from boomdp_jax.inference.under_numpyro.numpyro_model import make_model
 from boomdp_jax.interop.continuous_actions import ContinuousActions
 from boomdp_jax.physics import quantities, rollout, separation
 from boomdp_jax.planning.belief import mean_hypothesis
+from tests.inference.likelihoods.test_filter_density import level, two_bodies
 from tests.inference.linear_gaussian import SLOT, NoLikelihood, make_target
+from tests.inference.online.test_parts import particle_set
 from tests.inference.recordings import box_scene, free_box
-from tests.inference.test_filter_density import level, two_bodies
-from tests.inference.test_laplace_mixture import random_mixture
-from tests.inference.test_online_parts import particle_set
+from tests.inference.samplers.test_laplace_mixture import random_mixture
 from tests.models.worlds import cart
 from tests.physics.contact_scenes import FLOOR, body, spec_of
 from tests.products import check, products

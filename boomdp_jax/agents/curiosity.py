@@ -15,7 +15,7 @@ from boomdp_jax.agents.agent import ExploreFn
 from boomdp_jax.core.arrays import IntScalar, Key
 from boomdp_jax.envs.environment import AbstractEnvironment
 from boomdp_jax.envs.living_room import LivingRoom
-from boomdp_jax.inference.informative_wrench import informative_wrench
+from boomdp_jax.inference.pushes.informative_wrench import informative_wrench
 from boomdp_jax.models.per_body import PerBody, PerBodyLearnt
 from boomdp_jax.models.physics_model import PhysicsLearnt, PhysicsModel
 from boomdp_jax.physics.state import State

@@ -81,8 +81,8 @@ def _sweep(arguments: argparse.Namespace, spec) -> list[str]:
     """
     import jax
 
-    from boomdp_jax.inference.posterior import load_posterior
-    from boomdp_jax.inference.sweep import begin_sweep
+    from boomdp_jax.inference.posteriors.posterior import load_posterior
+    from boomdp_jax.inference.sweeps.sweep import begin_sweep
 
     shard, batch = arguments.shard or (0, 1), arguments.batch or 16
     sweep = begin_sweep(

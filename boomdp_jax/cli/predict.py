@@ -20,8 +20,8 @@ def run(arguments: argparse.Namespace) -> None:
     """
     with contextlib.redirect_stdout(sys.stderr):
         from boomdp_jax.core.history_file import load_transitions
-        from boomdp_jax.inference.posterior import load_posterior
-        from boomdp_jax.inference.predict import predict
+        from boomdp_jax.inference.posteriors.posterior import load_posterior
+        from boomdp_jax.inference.posteriors.predict import predict
 
         posterior = load_posterior(arguments.posterior)
         table = load_transitions(arguments.data, spec=posterior.spec)

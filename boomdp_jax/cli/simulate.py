@@ -195,7 +195,7 @@ def _load_params(
             print_notes([f"{spec.source}: unknown constraints are taken to be absent"])
         print_notes(_defaults(spec))
         return spec.params(), spec.substeps
-    from boomdp_jax.inference.posterior import load_posterior
+    from boomdp_jax.inference.posteriors.posterior import load_posterior
 
     posterior = load_posterior(arguments.posterior)
     as_in = f", as in {spec.source}"

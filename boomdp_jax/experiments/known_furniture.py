@@ -20,7 +20,7 @@ from boomdp_jax.envs.environment import EnvParams
 from boomdp_jax.envs.furniture import PIECES, Piece
 from boomdp_jax.envs.living_room import LivingRoom
 from boomdp_jax.experiments.teaching import Samples, taught
-from boomdp_jax.inference.online import OnlineBelief
+from boomdp_jax.inference.online.belief import OnlineBelief
 from boomdp_jax.models.known_kinds import KnownKinds, pinned_where_it_is
 from boomdp_jax.models.physics_model import PhysicsModel
 from boomdp_jax.physics.params import Params

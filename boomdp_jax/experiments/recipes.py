@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
-from boomdp_jax.inference.online import OnlineBelief
+from boomdp_jax.inference.online.belief import OnlineBelief
 from boomdp_jax.models.gaussian_process import GaussianProcess
 from boomdp_jax.models.linear import LinearRegression
 from boomdp_jax.models.locally_weighted import LocallyWeighted

@@ -10,7 +10,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Array, Float
 
-from boomdp_jax.inference.prior import DEFAULT_NOISE, NOISE_GROUPS
+from boomdp_jax.inference.hypotheses.prior import DEFAULT_NOISE, NOISE_GROUPS
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 

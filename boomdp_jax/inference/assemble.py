@@ -7,18 +7,22 @@ import jax
 import numpy as np
 
 from boomdp_jax.core.arrays import Key, on_device
-from boomdp_jax.inference.block import Block
-from boomdp_jax.inference.body_numbers import UNASKED, get_number, with_numbers
-from boomdp_jax.inference.contact_numbers import with_contact_numbers
-from boomdp_jax.inference.decode import decode
-from boomdp_jax.inference.evidence_report import BlockResult, report_evidence
-from boomdp_jax.inference.layout import BODY_NUMBERS
-from boomdp_jax.inference.model_sites import coordinate_names
-from boomdp_jax.inference.noise import host_generator
-from boomdp_jax.inference.noise_level import prior_noise
-from boomdp_jax.inference.posterior import Posterior
-from boomdp_jax.inference.residual_report import report_residuals
-from boomdp_jax.inference.slot_names import slot_names
+from boomdp_jax.core.random_numbers import host_generator
+from boomdp_jax.inference.blocks.block import Block
+from boomdp_jax.inference.blocks.model_sites import coordinate_names
+from boomdp_jax.inference.doubts.evidence_report import BlockResult, report_evidence
+from boomdp_jax.inference.doubts.residual_report import report_residuals
+from boomdp_jax.inference.hypotheses.body_numbers import (
+    UNASKED,
+    get_number,
+    with_numbers,
+)
+from boomdp_jax.inference.hypotheses.decode import decode
+from boomdp_jax.inference.hypotheses.layout import BODY_NUMBERS
+from boomdp_jax.inference.hypotheses.noise_level import prior_noise
+from boomdp_jax.inference.hypotheses.slot_names import slot_names
+from boomdp_jax.inference.posteriors.contact_numbers import with_contact_numbers
+from boomdp_jax.inference.posteriors.posterior import Posterior
 from boomdp_jax.physics.constraint_spec import JOINTS, KINDS
 from boomdp_jax.physics.params import WORLD, Params, empty_params
 from boomdp_jax.physics.scene_spec import SceneSpec

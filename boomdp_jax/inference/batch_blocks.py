@@ -4,15 +4,15 @@ import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from boomdp_jax.core.compile_ahead import signature
 from boomdp_jax.core.history import History
-from boomdp_jax.inference.block import Block, make_block
-from boomdp_jax.inference.compile_ahead import signature
-from boomdp_jax.inference.components import independent_blocks
-from boomdp_jax.inference.likelihoods import ChosenLikelihood
+from boomdp_jax.inference.blocks.block import Block, make_block
+from boomdp_jax.inference.doubts.still import bodies_let_be, let_be_note
+from boomdp_jax.inference.likelihoods.choice import ChosenLikelihood
 from boomdp_jax.inference.members import Refusals
-from boomdp_jax.inference.outliers import without_isolated
-from boomdp_jax.inference.still import bodies_let_be, let_be_note
-from boomdp_jax.inference.touching import find_touching
+from boomdp_jax.inference.readings.components import independent_blocks
+from boomdp_jax.inference.readings.outliers import without_isolated
+from boomdp_jax.inference.readings.touching import find_touching
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 Numbered = tuple[int, Block]

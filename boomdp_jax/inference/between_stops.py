@@ -7,10 +7,10 @@ import jax
 
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.core.history import History
-from boomdp_jax.inference.doubts import with_notes
-from boomdp_jax.inference.end_stops import without_stops
-from boomdp_jax.inference.posterior import Posterior
-from boomdp_jax.inference.sweep_failures import all_but_refused
+from boomdp_jax.inference.doubts.all_doubts import with_notes
+from boomdp_jax.inference.doubts.end_stops import without_stops
+from boomdp_jax.inference.failures import all_but_refused
+from boomdp_jax.inference.posteriors.posterior import Posterior
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 # Rows between stops, at least, to be inferred from alone; and what parts the random

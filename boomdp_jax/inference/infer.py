@@ -18,26 +18,26 @@ from boomdp_jax.inference.arguments import check_arguments
 from boomdp_jax.inference.assemble import assemble_posterior
 from boomdp_jax.inference.batch_blocks import blocks_of_batch
 from boomdp_jax.inference.between_stops import again_between_stops
-from boomdp_jax.inference.block import stack_blocks
-from boomdp_jax.inference.doubts import with_doubts, with_notes
-from boomdp_jax.inference.evidence_report import BlockResult
-from boomdp_jax.inference.fixed_structure import Structure, check_structure
-from boomdp_jax.inference.likelihoods import (
+from boomdp_jax.inference.blocks.block import stack_blocks
+from boomdp_jax.inference.blocks.fixed_structure import Structure, check_structure
+from boomdp_jax.inference.doubts.all_doubts import with_doubts, with_notes
+from boomdp_jax.inference.doubts.evidence_report import BlockResult
+from boomdp_jax.inference.doubts.residual import check_residuals
+from boomdp_jax.inference.likelihoods.choice import (
     ChosenLikelihood,
     choose_likelihood,
     outlier_remedy,
 )
+from boomdp_jax.inference.likelihoods.robust_update import DEGREES_OF_FREEDOM
 from boomdp_jax.inference.members import Refusals
-from boomdp_jax.inference.nuts import run_nuts
-from boomdp_jax.inference.one_structure import check_numbers
-from boomdp_jax.inference.outliers import outlier_notes
-from boomdp_jax.inference.posterior import Posterior, with_diagnostics
+from boomdp_jax.inference.posteriors.posterior import Posterior, with_diagnostics
 from boomdp_jax.inference.progress_bar import ProgressBar
-from boomdp_jax.inference.residual import check_residuals
-from boomdp_jax.inference.robust_update import DEGREES_OF_FREEDOM
+from boomdp_jax.inference.readings.outliers import outlier_notes
 from boomdp_jax.inference.sample import sample_blocks
-from boomdp_jax.inference.structure_draws import SampleSettings
-from boomdp_jax.inference.svi import run_svi
+from boomdp_jax.inference.samplers.structure_draws import SampleSettings
+from boomdp_jax.inference.under_numpyro.nuts import run_nuts
+from boomdp_jax.inference.under_numpyro.one_structure import check_numbers
+from boomdp_jax.inference.under_numpyro.svi import run_svi
 from boomdp_jax.physics.scene_spec import SceneSpec
 
 METHODS = ("auto", "rj", "enumerate", "smc", "nuts", "svi", "laplace", "map")

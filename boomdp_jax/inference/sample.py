@@ -8,44 +8,50 @@ import numpy as np
 from jaxtyping import Array
 
 from boomdp_jax.core.arrays import Key, on_device
+from boomdp_jax.core.compile_ahead import CompileAhead, signature
+from boomdp_jax.core.random_numbers import host_generator
 from boomdp_jax.core.spread import is_spread
-from boomdp_jax.inference.block_draws import BlockDraws
-from boomdp_jax.inference.chain_diagnostics import ChainDiagnostics, diagnose_chains
-from boomdp_jax.inference.compile_ahead import CompileAhead, signature
-from boomdp_jax.inference.enumerate_structures import enumerate_structures
-from boomdp_jax.inference.exact_starts import ExactStarts
-from boomdp_jax.inference.filter_points import filter_densities, filter_points
-from boomdp_jax.inference.find_modes import (
+from boomdp_jax.inference.fits.find_modes import (
     Found,
     find_modes,
     find_modes_of_exact_starts,
 )
-from boomdp_jax.inference.fit import Host, Modes
-from boomdp_jax.inference.laplace_draws import best_hypothesis, sample_laplace
-from boomdp_jax.inference.linear_track import LinearTracks
-from boomdp_jax.inference.noise import host_generator
-from boomdp_jax.inference.noise_correction import infer_noise, noise_about_peaks
-from boomdp_jax.inference.noise_level import NoiseFit
-from boomdp_jax.inference.noise_scales import draw_noise_scales
-from boomdp_jax.inference.population import Population, sample_population
-from boomdp_jax.inference.structure_draws import (
+from boomdp_jax.inference.fits.fit import Host, Modes
+from boomdp_jax.inference.hypotheses.noise_level import NoiseFit
+from boomdp_jax.inference.likelihoods.exact_starts import ExactStarts
+from boomdp_jax.inference.likelihoods.filter_points import (
+    filter_densities,
+    filter_points,
+)
+from boomdp_jax.inference.likelihoods.target import StructureTarget
+from boomdp_jax.inference.noise.correction import infer_noise, noise_about_peaks
+from boomdp_jax.inference.noise.linear_track import LinearTracks
+from boomdp_jax.inference.noise.scales import draw_noise_scales
+from boomdp_jax.inference.samplers.block_draws import BlockDraws
+from boomdp_jax.inference.samplers.chain_diagnostics import (
+    ChainDiagnostics,
+    diagnose_chains,
+)
+from boomdp_jax.inference.samplers.enumerate_structures import enumerate_structures
+from boomdp_jax.inference.samplers.laplace_draws import best_hypothesis, sample_laplace
+from boomdp_jax.inference.samplers.population import Population, sample_population
+from boomdp_jax.inference.samplers.structure_draws import (
     SampleSettings,
     StructureDraws,
     chains_agree,
     pick_object,
     start_mixtures,
 )
-from boomdp_jax.inference.structure_evidence import (
+from boomdp_jax.inference.samplers.structure_evidence import (
     StructureEvidence,
     VisitedShares,
     evidence_by_importance,
     odds_disagree,
     visited_shares,
 )
-from boomdp_jax.inference.target import StructureTarget
-from boomdp_jax.inference.tempered_smc import sample_tempered
-from boomdp_jax.inference.walker_moves import MoveCounts
-from boomdp_jax.inference.weighing import evaluate_each
+from boomdp_jax.inference.samplers.tempered_smc import sample_tempered
+from boomdp_jax.inference.samplers.walker_moves import MoveCounts
+from boomdp_jax.inference.samplers.weighing import evaluate_each
 
 # Importance sampling is heard only with as many effective draws.
 _MIN_SAMPLE_SIZE = 100.0

@@ -7,10 +7,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from boomdp_jax.inference.body_numbers import get_number
-from boomdp_jax.inference.layout import BODY_NUMBERS
-from boomdp_jax.inference.posterior import Posterior
-from boomdp_jax.inference.summary import CHANNELS
+from boomdp_jax.inference.hypotheses.body_numbers import get_number
+from boomdp_jax.inference.hypotheses.layout import BODY_NUMBERS
+from boomdp_jax.inference.posteriors.posterior import Posterior
+from boomdp_jax.inference.posteriors.summary import CHANNELS
 from boomdp_jax.physics.constraint_spec import JOINTS, KINDS
 from boomdp_jax.physics.params import Params
 

@@ -12,7 +12,7 @@ import jax
 from jaxtyping import Array, PyTree
 
 from boomdp_jax.envs import AbstractEnvironment, EnvParams
-from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.posteriors.posterior import Posterior
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.same_bodies import check_same_bodies
 

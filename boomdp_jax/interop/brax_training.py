@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.posteriors.posterior import Posterior
 from boomdp_jax.interop.brax_env import BraxTask
 from boomdp_jax.interop.brax_posterior import task_randomisation
 from boomdp_jax.physics.params import Params

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.posteriors.posterior import Posterior
 from boomdp_jax.interop.mjcf_document import load_mujoco
 from boomdp_jax.interop.mjcf_export import to_mjcf
 from boomdp_jax.physics.params import Params

@@ -16,7 +16,7 @@ import numpy as np
 
 from boomdp_jax.core.arrays import on_device
 from boomdp_jax.core.history import History
-from boomdp_jax.inference.sweep import Sweep
+from boomdp_jax.inference.sweeps.sweep import Sweep
 from boomdp_jax.physics.scene_spec import scene_spec_from_dict
 
 

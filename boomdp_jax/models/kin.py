@@ -6,7 +6,7 @@ a kind of its own: a new thing is of the kind of thing i, or of a new one, with 
 $$w_i = \frac{p(\text{look} \mid i)}{p(\text{look})}, \qquad w_0 = \alpha,$$
 
 where the look is its label (one draw seen of a symmetric Dirichlet over labels) and the
-outline's features (`inference.kind_features`, normal about those of thing i with the
+outline's features (`inference.kinds.features`, normal about those of thing i with the
 spread of a kind, against standard normal over all sorts of things). Of a kind that was
 tried, hypotheses are draws of that thing's posterior, some apart in density; of a new
 one, draws of the prior. It is the collapsed Gibbs step of `infer_kinds` for a thing
@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from boomdp_jax.inference.kind_features import outline_features
+from boomdp_jax.inference.kinds.features import outline_features
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene_spec import SceneSpec
 

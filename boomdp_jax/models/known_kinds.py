@@ -3,8 +3,8 @@ r"""A belief over which kind a thing is, of kinds that were learnt beforehand.
 The papers' successor recognised furniture so: a prior over modes that were learnt on
 single objects. Hypotheses are a fixed list of params; the weight of each is its prior
 times the likelihood of the one-step predictions, with the noise of each channel group
-integrated out (`inference.one_step`). Nothing outside the list is ever found: a thing
-of no known kind is taken for the nearest one.
+integrated out (`inference.likelihoods.one_step`). Nothing outside the list is ever
+found: a thing of no known kind is taken for the nearest one.
 
 A pin holds a thing where it stands: the world's end of every pin is put, before each
 row, where the thing's own anchor is.
@@ -20,7 +20,11 @@ from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import BoolScalar, Key
 from boomdp_jax.envs.environment import wrapped
-from boomdp_jax.inference.one_step import NoiseStatistics, group_sums, log_marginal
+from boomdp_jax.inference.likelihoods.one_step import (
+    NoiseStatistics,
+    group_sums,
+    log_marginal,
+)
 from boomdp_jax.models.model import AbstractModel
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene

@@ -20,8 +20,8 @@ from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import BoolScalar, Key
 from boomdp_jax.core.history import make_history
-from boomdp_jax.inference.plain_metropolis import plain_metropolis
-from boomdp_jax.inference.plain_problem import plain_problem
+from boomdp_jax.inference.samplers.plain_metropolis import plain_metropolis
+from boomdp_jax.inference.samplers.plain_problem import plain_problem
 from boomdp_jax.models.model import AbstractModel
 from boomdp_jax.models.per_body import MovedFreely
 from boomdp_jax.models.table import check_at_least

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from boomdp_jax.core.arrays import BoolScalar, Key
-from boomdp_jax.inference.online import OnlineBelief
-from boomdp_jax.inference.online_state import BeliefState
+from boomdp_jax.inference.online.belief import OnlineBelief
+from boomdp_jax.inference.online.state import BeliefState
 from boomdp_jax.models.model import AbstractModel
 from boomdp_jax.models.true_model import Advance
 from boomdp_jax.physics.state import State

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from boomdp_jax.core.arrays import Key
+from boomdp_jax.core.random_numbers import host_generator
 from boomdp_jax.core.thread_precision import in_this_precision
 from boomdp_jax.envs.namo_room import Room, thing_scene
-from boomdp_jax.inference.noise import host_generator
 from boomdp_jax.models.kin import kin_draws, kin_odds
 from boomdp_jax.models.thing_belief import (
     NUM_HYPOTHESES,

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from boomdp_jax.core.arrays import Key
-from boomdp_jax.inference.online import OnlineBelief
-from boomdp_jax.inference.online_state import BeliefState
+from boomdp_jax.inference.online.belief import OnlineBelief
+from boomdp_jax.inference.online.state import BeliefState
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.scene_spec import SceneSpec

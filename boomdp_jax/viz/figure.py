@@ -4,7 +4,7 @@ import os
 from typing import Any
 
 from boomdp_jax.core.history import History
-from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.posteriors.posterior import Posterior
 from boomdp_jax.viz.posteriors import draw_posterior
 from boomdp_jax.viz.predictions import draw_prediction
 from boomdp_jax.viz.snapshots import new_figure

@@ -6,15 +6,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from boomdp_jax.inference.posterior import Posterior
-from boomdp_jax.inference.structure_report import (
+from boomdp_jax.inference.posteriors.posterior import Posterior
+from boomdp_jax.inference.posteriors.structure_report import (
     Slots,
     axle_offsets,
     constraint_draws,
     group_by_structure,
     relabel,
 )
-from boomdp_jax.inference.summary import (
+from boomdp_jax.inference.posteriors.summary import (
     axial_difference,
     axial_mean,
     weighted_quantiles,

@@ -9,9 +9,9 @@ import numpy as np
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.core.history import History
 from boomdp_jax.core.quick_compile import KeptJit
-from boomdp_jax.inference.posterior import Posterior
-from boomdp_jax.inference.predict import commands_in_effect, sample_readings
-from boomdp_jax.inference.prediction_starts import PredictionStarts
+from boomdp_jax.inference.posteriors.posterior import Posterior
+from boomdp_jax.inference.posteriors.predict import commands_in_effect, sample_readings
+from boomdp_jax.inference.posteriors.prediction_starts import PredictionStarts
 from boomdp_jax.viz.style import BASELINE, PREDICTION, READING
 
 _sample = KeptJit(sample_readings, static=("freedom", "is_true"))

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.posteriors.posterior import Posterior
 from boomdp_jax.viz.style import EDGE, WHEEL
 
 _FEWEST_ROWS = 3

@@ -108,7 +108,7 @@ def test_predict_prints_a_table_for_people(
 
 @pytest.mark.slow
 def test_a_draw_simulates_the_box_it_describes(folder: Path, posterior: Path):
-    from boomdp_jax.inference.posterior import load_posterior
+    from boomdp_jax.inference.posteriors.posterior import load_posterior
 
     command = (
         f"simulate {folder}/scene.json --actions {folder}/actions.npz --out "

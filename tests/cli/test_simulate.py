@@ -13,7 +13,7 @@ from boomdp_jax.cli.main import main
 from boomdp_jax.core.history_file import load_transitions
 from boomdp_jax.physics import rollout
 from boomdp_jax.physics.scene_file import load_scene
-from tests.inference.posteriors import make_posterior
+from tests.inference.made_posteriors import make_posterior
 
 DENSITY, HALF_EXTENTS, DT = 10.0, (0.5, 0.3), 0.02
 MASS = DENSITY * 4 * HALF_EXTENTS[0] * HALF_EXTENTS[1]

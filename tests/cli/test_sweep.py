@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from boomdp_jax.cli.main import main
-from boomdp_jax.inference import sweep as sweeps
 from boomdp_jax.inference.members import Refusals
-from tests.inference.test_sweep import cheap_batch
+from boomdp_jax.inference.sweeps import sweep as sweeps
+from tests.inference.sweeps.test_sweep import cheap_batch
 
 SCENE = {
     "schema": "planar-scene-1",

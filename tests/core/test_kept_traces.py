@@ -314,7 +314,7 @@ def test_a_folder_that_is_gone_is_done_without(folder):
 _INFERS = """
 import hashlib, json, sys, jax, numpy as np
 from boomdp_jax import infer, keep_programs, load_history, load_scene
-from boomdp_jax.inference.filtered_likelihood import FilteredLikelihood
+from boomdp_jax.inference.likelihoods.filtered_likelihood import FilteredLikelihood
 traced, whitened = [], FilteredLikelihood.whitened
 def counted(*arguments):
     traced.append(1)

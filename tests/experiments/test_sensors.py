@@ -8,7 +8,7 @@ import pytest
 from boomdp_jax.envs import Cart
 from boomdp_jax.experiments.registry import subject_of
 from boomdp_jax.experiments.sensors import with_sensors
-from boomdp_jax.inference.prior import read_prior
+from boomdp_jax.inference.hypotheses.prior import read_prior
 
 
 def test_the_prior_is_around_what_sensors_err_but_no_less_than_by_default():

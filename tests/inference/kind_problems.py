@@ -5,10 +5,10 @@ from collections.abc import Iterator
 import numpy as np
 from scipy import stats
 
-from boomdp_jax.inference.kind_coordinates import CoordinateModel
-from boomdp_jax.inference.kind_prior import KindPrior
-from boomdp_jax.inference.kind_state import KindData
-from boomdp_jax.inference.likelihood_bumps import bump_of_posterior, join_bumps
+from boomdp_jax.inference.kinds.coordinates import CoordinateModel
+from boomdp_jax.inference.kinds.likelihood_bumps import bump_of_posterior, join_bumps
+from boomdp_jax.inference.kinds.prior import KindPrior
+from boomdp_jax.inference.kinds.state import KindData
 
 SPREADS, WEIGHTS = (0.15, 0.6, 1.0), (0.5, 0.3, 0.2)
 NOISE = 0.3

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Array
 from scipy import stats
 
-from boomdp_jax.inference.laplace_mixture import LaplaceMixture, make_mixture
-from boomdp_jax.inference.target import StructureTarget
+from boomdp_jax.inference.likelihoods.target import StructureTarget
+from boomdp_jax.inference.samplers.laplace_mixture import LaplaceMixture, make_mixture
 
 SLOT = np.array([-1, 0, 1, 1, 2])
 # Not every combination exists, so structures differ in how many neighbours they have.

@@ -6,9 +6,9 @@ import jax
 import numpy as np
 
 from boomdp_jax.core.history import History, make_history
-from boomdp_jax.inference.block import make_block, stack_blocks
-from boomdp_jax.inference.noise_level import NoiseFit, prior_noise
-from boomdp_jax.inference.target import StructureTarget
+from boomdp_jax.inference.blocks.block import make_block, stack_blocks
+from boomdp_jax.inference.hypotheses.noise_level import NoiseFit, prior_noise
+from boomdp_jax.inference.likelihoods.target import StructureTarget
 from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
 from boomdp_jax.physics.state import state_from_array
 from boomdp_jax.physics.step import step

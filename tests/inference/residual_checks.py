@@ -3,9 +3,9 @@
 import numpy as np
 
 from boomdp_jax.core.history import History
-from boomdp_jax.inference.block import make_block, stack_blocks
-from boomdp_jax.inference.block_draws import BlockDraws
-from boomdp_jax.inference.residual import ResidualCheck, check_residuals
+from boomdp_jax.inference.blocks.block import make_block, stack_blocks
+from boomdp_jax.inference.doubts.residual import ResidualCheck, check_residuals
+from boomdp_jax.inference.samplers.block_draws import BlockDraws
 from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
 from tests.inference.recordings import AREA, DT, MASS, SIZE
 

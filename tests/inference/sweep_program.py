@@ -8,7 +8,7 @@ import sys
 import jax
 import numpy as np
 
-from boomdp_jax.inference.sweep import infer_sweep
+from boomdp_jax.inference.sweeps.sweep import infer_sweep
 from tests.inference.recordings import box_scene, free_box
 
 NUM_OBJECTS = 8

@@ -9,7 +9,7 @@ import scipy.stats
 from boomdp_jax.core import make_history
 from boomdp_jax.inference import infer, infer_batch
 from boomdp_jax.inference.arguments import check_arguments, check_history
-from boomdp_jax.inference.block import make_block
+from boomdp_jax.inference.blocks.block import make_block
 from boomdp_jax.inference.infer import padded_histories
 from boomdp_jax.physics import scene_spec_from_dict
 

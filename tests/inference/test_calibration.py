@@ -18,11 +18,11 @@ import numpy as np
 import pytest
 from jaxtyping import Array
 
-from boomdp_jax.inference import enumerate_structures
-from boomdp_jax.inference.adapt_mixture import adapt_mixtures
-from boomdp_jax.inference.exact_starts import ExactStarts
+from boomdp_jax.inference.likelihoods.exact_starts import ExactStarts
 from boomdp_jax.inference.sample import sample_blocks
-from boomdp_jax.inference.structure_draws import SampleSettings
+from boomdp_jax.inference.samplers import enumerate_structures
+from boomdp_jax.inference.samplers.adapt_mixture import adapt_mixtures
+from boomdp_jax.inference.samplers.structure_draws import SampleSettings
 from boomdp_jax.physics import Params, State, step
 from tests.inference.prior_objects import PriorObjects, draw_objects
 from tests.reference.ranks import NUM_DRAWS, rank, thin, uniformity

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from boomdp_jax.core.history import make_history
-from boomdp_jax.inference.block import make_block
-from boomdp_jax.inference.components import independent_blocks
-from boomdp_jax.inference.contact_numbers import with_contact_numbers
-from boomdp_jax.inference.filter_density import filter_density
-from boomdp_jax.inference.kalman import NoiseLevel
-from boomdp_jax.inference.model_sites import block_sites
-from boomdp_jax.inference.posterior import load_posterior
-from boomdp_jax.inference.touching import find_touching
+from boomdp_jax.inference.blocks.block import make_block
+from boomdp_jax.inference.blocks.model_sites import block_sites
+from boomdp_jax.inference.likelihoods.filter_density import filter_density
+from boomdp_jax.inference.likelihoods.kalman import NoiseLevel
+from boomdp_jax.inference.posteriors.contact_numbers import with_contact_numbers
+from boomdp_jax.inference.posteriors.posterior import load_posterior
+from boomdp_jax.inference.readings.components import independent_blocks
+from boomdp_jax.inference.readings.touching import find_touching
 from boomdp_jax.physics import Surface, empty_params, scene_spec_from_dict
-from tests.inference.posteriors import make_posterior
+from tests.inference.made_posteriors import make_posterior
 from tests.inference.two_discs import (
     DT,
     NOISE,

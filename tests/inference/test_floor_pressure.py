@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from boomdp_jax.inference import infer_batch
-from boomdp_jax.inference.stance_doubts import stance_reasons
+from boomdp_jax.inference.doubts.stance_doubts import stance_reasons
 from boomdp_jax.physics import empty_params
-from tests.inference.posteriors import draws_like, make_posterior, table_spec
+from tests.inference.made_posteriors import draws_like, make_posterior, table_spec
 from tests.inference.standing_objects import pushed_object
 
 NUM_OBJECTS = 6

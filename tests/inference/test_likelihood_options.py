@@ -8,8 +8,8 @@ from scipy import stats
 
 import boomdp_jax
 from boomdp_jax.core.history import History, make_history
-from boomdp_jax.inference.block import make_block
-from boomdp_jax.inference.sweep import infer_sweep
+from boomdp_jax.inference.blocks.block import make_block
+from boomdp_jax.inference.sweeps.sweep import infer_sweep
 from boomdp_jax.interop import hide, random_object, record_random_pushes
 from boomdp_jax.physics import State, step
 from boomdp_jax.physics.scene_spec import SceneSpec

@@ -7,10 +7,10 @@ import scipy.stats
 
 import boomdp_jax
 from boomdp_jax.core import make_history
-from boomdp_jax.inference.layout import block_layout, structures
-from boomdp_jax.inference.nuts import run_nuts
-from boomdp_jax.inference.posterior import load_posterior
-from boomdp_jax.inference.prior import read_prior
+from boomdp_jax.inference.hypotheses.layout import block_layout, structures
+from boomdp_jax.inference.hypotheses.prior import read_prior
+from boomdp_jax.inference.posteriors.posterior import load_posterior
+from boomdp_jax.inference.under_numpyro.nuts import run_nuts
 from tests.inference.joint_recordings import (
     AXIS,
     DENSITY,

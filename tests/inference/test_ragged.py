@@ -4,12 +4,12 @@ import jax
 import numpy as np
 import pytest
 
-from boomdp_jax.inference.block import make_block, stack_blocks
-from boomdp_jax.inference.compile_ahead import signature
-from boomdp_jax.inference.evaluate import evaluate_points
-from boomdp_jax.inference.find_modes import find_modes
-from boomdp_jax.inference.fit import FitSettings
+from boomdp_jax.core.compile_ahead import signature
+from boomdp_jax.inference.blocks.block import make_block, stack_blocks
+from boomdp_jax.inference.fits.find_modes import find_modes
+from boomdp_jax.inference.fits.fit import FitSettings
 from boomdp_jax.inference.infer import padded_histories
+from boomdp_jax.inference.likelihoods.evaluate import evaluate_points
 from tests.inference.recordings import box_scene, free_box
 
 

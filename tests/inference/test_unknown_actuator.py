@@ -11,12 +11,12 @@ from scipy import stats
 
 import boomdp_jax
 from boomdp_jax.core.history import History, make_history
-from boomdp_jax.inference.fit import FitSettings
-from boomdp_jax.inference.identifiability import identifiability
-from boomdp_jax.inference.kinds import infer_kinds
-from boomdp_jax.inference.numpyro_model import make_model
-from boomdp_jax.inference.online import OnlineBelief
-from boomdp_jax.inference.posterior import load_posterior
+from boomdp_jax.inference.fits.fit import FitSettings
+from boomdp_jax.inference.kinds.infer_kinds import infer_kinds
+from boomdp_jax.inference.online.belief import OnlineBelief
+from boomdp_jax.inference.posteriors.posterior import load_posterior
+from boomdp_jax.inference.pushes.identifiability import identifiability
+from boomdp_jax.inference.under_numpyro.numpyro_model import make_model
 from boomdp_jax.physics import (
     Actuator,
     SceneSpec,
@@ -25,7 +25,7 @@ from boomdp_jax.physics import (
     rollout,
     scene_spec_from_dict,
 )
-from tests.inference.posteriors import table_posterior
+from tests.inference.made_posteriors import table_posterior
 
 DT, DENSITY = 0.02, 20.0
 NOISE = np.array([1e-3, 1e-3, 1e-3, 5e-3, 5e-3, 5e-3])

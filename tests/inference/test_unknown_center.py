@@ -11,12 +11,12 @@ from scipy import stats
 
 import boomdp_jax
 from boomdp_jax.core.history import History, make_history
-from boomdp_jax.inference.fit import FitSettings
-from boomdp_jax.inference.identifiability import identifiability
-from boomdp_jax.inference.numpyro_model import make_model
-from boomdp_jax.inference.posterior import Posterior, load_posterior
+from boomdp_jax.inference.fits.fit import FitSettings
+from boomdp_jax.inference.posteriors.posterior import Posterior, load_posterior
+from boomdp_jax.inference.pushes.identifiability import identifiability
+from boomdp_jax.inference.under_numpyro.numpyro_model import make_model
 from boomdp_jax.physics import SceneSpec, State, rollout, scene_spec_from_dict
-from tests.inference.posteriors import table_posterior, table_spec
+from tests.inference.made_posteriors import table_posterior, table_spec
 
 DT, DENSITY = 0.02, 20.0
 NOISE = np.array([1e-3, 1e-3, 1e-3, 5e-3, 5e-3, 5e-3])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from boomdp_jax.interop.arviz import to_arviz
-from tests.inference.posteriors import table_posterior
+from tests.inference.made_posteriors import table_posterior
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import pytest
 from boomdp_jax.envs import Pendulum
 from boomdp_jax.interop import BraxTask, train_ppo
 from boomdp_jax.physics.scene_spec import scene_spec_from_dict
-from tests.inference.posteriors import table_posterior
+from tests.inference.made_posteriors import table_posterior
 
 with warnings.catch_warnings():
     # Of a library that brax uses.

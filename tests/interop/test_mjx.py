@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from boomdp_jax.inference.posterior import Posterior
+from boomdp_jax.inference.posteriors.posterior import Posterior
 from boomdp_jax.interop import brax_randomisation, randomise_mjx, to_mjcf
 from tests.interop.mjcf_worlds import ball, box, joint, scene
 

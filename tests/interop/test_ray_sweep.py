@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from boomdp_jax.inference import SweepError
-from boomdp_jax.inference import sweep as sweeps
 from boomdp_jax.inference.members import Refusals
-from boomdp_jax.inference.sweep import Sweep, begin_sweep, infer_sweep
+from boomdp_jax.inference.sweeps import sweep as sweeps
+from boomdp_jax.inference.sweeps.sweep import Sweep, begin_sweep, infer_sweep
 from boomdp_jax.interop.ray_sweep import sweep_with_ray
 from tests.inference.recordings import box_scene, free_box
-from tests.inference.test_sweep import assert_same_arrays, cheap_batch
+from tests.inference.sweeps.test_sweep import assert_same_arrays, cheap_batch
 
 KEY = 11
 

@@ -22,7 +22,7 @@ from boomdp_jax.viz import (
     plot_posterior,
 )
 from boomdp_jax.viz.learning_curves import plot_curves
-from tests.inference.posteriors import (
+from tests.inference.made_posteriors import (
     draws_like,
     make_posterior,
     room_spec,

@@ -1,0 +1,1 @@
+"""Bodies that must be inferred together, as a sampling problem with names."""

@@ -1,0 +1,1 @@
+"""Reasons not to trust a posterior, looked for in the readings and in what is left."""

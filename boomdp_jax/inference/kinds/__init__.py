@@ -1,0 +1,1 @@
+"""Objects of a few kinds, which tell of each other: a Dirichlet-process mixture."""

@@ -1,0 +1,1 @@
+"""How well a hypothesis explains readings: single steps, and filters of noisy ones."""

@@ -1,0 +1,1 @@
+"""Noise of readings and of the motion, inferred along with everything else."""

@@ -1,0 +1,1 @@
+"""A belief that takes one transition at a time, in compiled functions of arrays."""

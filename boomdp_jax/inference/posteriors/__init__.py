@@ -1,0 +1,1 @@
+"""What is known after the data: draws with names, reports, files, predictions."""

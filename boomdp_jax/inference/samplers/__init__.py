@@ -1,0 +1,1 @@
+"""Draws over structures and numbers: fitted mixtures, jumps, tempering, evidence."""

@@ -1,0 +1,1 @@
+"""What a user of NumPyro asks for: a model of a structure, NUTS, SVI, a kernel."""

@@ -1,0 +1,74 @@
+"""Which bodies may have touched where angles, or bodies, are not read at all times."""
+
+import numpy as np
+import pytest
+
+from boomdp_jax.core.history import make_history
+from boomdp_jax.inference.readings.touching import find_touching
+from boomdp_jax.physics import scene_spec_from_dict
+from tests.inference.two_discs import DT
+
+GIVEN = {"friction": 0.4, "restitution": 0.3}
+
+
+def crossing(*, outline=None, num=12):
+    """Poses of a disc and of what it runs into, `[instant, 2, 3]`, and the scene."""
+    outline = outline or {"type": "circle", "radius": 0.1}
+    shapes = [{"type": "circle", "radius": 0.1}, outline]
+    bodies = [
+        {"name": name, "shape": shape, "contact": GIVEN}
+        for name, shape in zip("ab", shapes, strict=True)
+    ]
+    spec = scene_spec_from_dict(
+        {"schema": "planar-scene-1", "dt": DT, "bodies": bodies}, source="test"
+    )
+    pose = np.zeros((num, 2, 3))
+    pose[:, 0, 0] = np.linspace(0.0, 0.35, num)
+    pose[:, 1, 0] = 0.5
+    if outline["type"] == "circle":
+        # They spin, which is nothing to where their outlines are.
+        pose[..., 2] = np.linspace(0.0, 40.0, num)[:, None]
+    return spec, pose
+
+
+def touch(spec, pose):
+    state = np.full((*pose.shape[:2], 6), np.nan)
+    state[..., :3] = pose
+    action = np.zeros((len(pose) - 1, 2, 3))
+    history = make_history(state[:-1], action, state[1:], DT)
+    return bool(find_touching(spec, history).pairs[0, 1])
+
+
+@pytest.mark.parametrize("which", ["never", "in turn", "of one", "bodies in turn"])
+def test_discs_touch_whether_or_not_their_angles_are_read(which):
+    spec, pose = crossing()
+    near, far = np.array(pose), np.array(pose)
+    far[:, 1, 0] += 0.1
+    for each, expected in ((near, True), (far, False)):
+        if which == "never":
+            each[..., 2] = np.nan
+        elif which == "in turn":
+            each[::2, :, 2] = np.nan
+            each[1::2, :, :2] = np.nan
+        elif which == "of one":
+            each[:, 0, 2] = np.nan
+        else:
+            each[::2, 0] = np.nan
+            each[1::2, 1] = np.nan
+        assert touch(spec, each) == expected
+
+
+def test_an_outline_whose_angle_is_unread_is_taken_for_the_circle_round_it():
+    """A long box across the way of a disc: which of its sides is unknown."""
+    box = {"type": "box", "half_extents": [0.02, 0.2]}
+    spec, pose = crossing(outline=box)
+    pose[:, 1, 0] = 0.6
+    assert not touch(spec, pose)
+    some = np.array(pose)
+    some[:6, 1, 2] = np.nan
+    # Where it is near its angle was read.
+    assert not touch(spec, some)
+    pose[:, 1, 2] = np.nan
+    assert touch(spec, pose)
+    pose[:, 1, 0] = 0.8
+    assert not touch(spec, pose)
