@@ -208,6 +208,34 @@ def test_likelihood_is_that_of_the_closed_form(share):
     )
 
 
+def test_rows_in_which_nothing_is_near_are_worked_out_without_contact():
+    """They meet in row 12 of 26; readings say the same as with contact in all."""
+    rng = np.random.default_rng(5)
+    start = approaching(rng, 12.5 * DT, closing=(0.8, 0.9))
+    history = record(rng, start, (1.5, 0.8, 0.7, 0.05), 26).padded(32)
+    block = block_of(discs_spec(), history, (0, 1))
+    likelihood: Any = block.target.log_likelihood
+    near = np.asarray(likelihood.data.may_touch)
+    assert near[11:14].all()
+    assert near.sum() < 9
+    coordinates, data = likelihood.coordinates, likelihood.data
+    reading = jnp.array([NOISE[0], NOISE[2], 4e-3, 4e-3])
+    noise = NoiseLevel(jnp.tile(reading, (2, 1)), jnp.full((2, 2), 1e-6))
+
+    @jax.jit
+    def of(z, data):
+        params = coordinates(z, jnp.zeros(0, bool))
+        return filter_density(coordinates.world, params, data, noise)
+
+    everywhere = dataclasses.replace(data, may_touch=jnp.ones_like(data.may_touch))
+    nowhere = dataclasses.replace(data, may_touch=jnp.zeros_like(data.may_touch))
+    for z in 0.3 * rng.standard_normal((4, 4)):
+        told = float(of(jnp.asarray(z), data))
+        assert told == pytest.approx(float(of(jnp.asarray(z), everywhere)), abs=1e-5)
+        # The test can fail: without contact where they meet nothing is explained.
+        assert told > float(of(jnp.asarray(z), nowhere)) + 100.0
+
+
 def test_what_no_block_says_comes_from_the_prior():
     spec = discs_spec(prior={"contact.friction": {"center": 0.2, "spread": 0.5}})
     params = empty_params(2)

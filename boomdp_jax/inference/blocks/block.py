@@ -85,10 +85,8 @@ def make_block(
     # An empty table needs room for one row, from which shapes can be told.
     history = history.padded(max(history.capacity, 1))
     options = read_prior(spec.prior, spec.source)
-    contact, inferred = None, ()
-    if touching is not None and touching.pairs[list(bodies)].any():
-        contact = block_contact(spec, bodies, touching)
-        inferred = touching.inferred_in(spec, bodies)
+    touches = touching is not None and touching.pairs[list(bodies)].any()
+    inferred = touching.inferred_in(spec, bodies) if touches else ()
     may_tie = options.probability["tie"] > 0
     layout = block_layout(spec, bodies, inferred, may_tie=may_tie)
     trusted = history if freedom is None else without_isolated(history)
@@ -109,13 +107,15 @@ def make_block(
     num_parts = 1
     if cuts_turns and spec.substeps is None:
         num_parts = _parts_of_turns(history, bodies)
+    scene = _block_scene(spec, bodies, np.asarray(history.dt), num_parts)
+    contact = block_contact(spec, bodies, touching, scene) if touches else None
     coordinates = Coordinates(
         layout=layout,
         scales=prior_scales(options),
         surroundings=surroundings(
             spec, bodies, layout, poses, _forces(history, bodies)
         ),
-        scene=_block_scene(spec, bodies, np.asarray(history.dt), num_parts),
+        scene=scene,
         contact=contact,
     )
     if is_uniform is None:
@@ -128,6 +128,9 @@ def make_block(
     )
     if weight is not None:
         data = dataclasses.replace(data, weight=on_device(weight))
+    if touches:
+        near = touching.near_rows(bodies, history.capacity)
+        data = dataclasses.replace(data, may_touch=on_device(near, bool))
     scale = np.asarray(coordinates.scales.noise)
     reference = np.tile(scale[None], (len(bodies), 1))
     gains = one_step_gains(data, channel_scale(reference))

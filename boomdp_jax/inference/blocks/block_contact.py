@@ -13,6 +13,7 @@ from boomdp_jax.inference.hypotheses.contact_prediction import (
 from boomdp_jax.inference.hypotheses.coordinates import Contact
 from boomdp_jax.inference.hypotheses.first_touch import sort_pairs
 from boomdp_jax.inference.readings.touching import Touching
+from boomdp_jax.physics.scene import Scene
 from boomdp_jax.physics.scene_arrays import DEFAULT_FRICTION, DEFAULT_RESTITUTION
 from boomdp_jax.physics.scene_spec import SceneSpec
 
@@ -33,7 +34,7 @@ _OF_BODIES = (
 
 
 def block_contact(
-    spec: SceneSpec, bodies: tuple[int, ...], touching: Touching
+    spec: SceneSpec, bodies: tuple[int, ...], touching: Touching, apart: Scene
 ) -> Contact:
     """Gather outlines, walls and surfaces.
 
@@ -41,6 +42,7 @@ def block_contact(
         spec: a scene with contact.
         bodies: indices of the block's bodies in the scene.
         touching: what may have touched.
+        apart: the scene of these bodies without contact.
 
     Returns:
         What `Coordinates` need. Bodies that never came near each other are not
@@ -79,6 +81,7 @@ def block_contact(
             scene=scene,
             wall_pose=on_device(spec.pose[list(walls)].reshape(-1, 3)),
             sorts=sort_pairs(pairs, is_disc),
+            apart=apart,
         ),
         friction=on_device(known("friction", DEFAULT_FRICTION)),
         restitution=on_device(known("restitution", DEFAULT_RESTITUTION)),

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
@@ -123,6 +124,13 @@ def with_open_loop(targets: StructureTarget, starts: ExactStarts) -> StructureTa
         shape = (num_objects, num_structures, *stacked.shape[2:])
         return on_device(np.broadcast_to(stacked, shape), stacked.dtype)
 
+    if likelihood.data.may_touch is not None:
+        # Predictions may lead to where nothing was.
+        targets = eqx.tree_at(
+            lambda t: t.log_likelihood.data.may_touch,
+            targets,
+            jnp.ones_like(likelihood.data.may_touch),
+        )
     return eqx.tree_at(
         lambda t: t.log_likelihood.gains, targets, jax.tree.map(arrange, *each)
     )

@@ -87,7 +87,7 @@ def filter_density(
         offset = neighbour_scales(scale, jnp.diagonal(covariance))
         offsets = jnp.diag(offset).reshape(num, num_bodies, 6)
         points = jnp.concatenate([state[None], state[None] + offsets])
-        images = predict(points, row.action, row.dt)
+        images = predict(points, row.action, row.dt, row.may_touch)
         state = images[0]
         rise = (images[1:] - state[None]).reshape(num, num)
         miss = channel_difference(row.last, state).reshape(-1)
@@ -178,7 +178,7 @@ def _cloud_of_channels(predict: PredictChannels, rows: TrackRow):
     """
 
     def one(row: TrackRow, *point):
-        return predict(list(point), row.action, row.dt)
+        return predict(list(point), row.action, row.dt, row.may_touch)
 
     first = jax.tree.map(lambda leaf: leaf[0], rows)
     pure, known = jax.closure_convert(one, first, *jnp.zeros(6))

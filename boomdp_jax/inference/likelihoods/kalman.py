@@ -176,7 +176,7 @@ class RowFilter:
         offset = neighbour_scales(self._scale, jnp.diagonal(covariance))
         offsets = jnp.diag(offset).reshape(num, *state.shape)
         points = jnp.concatenate([state[None], state[None] + offsets])
-        images = self._predict(points, row.action, row.dt)
+        images = self._predict(points, row.action, row.dt, row.may_touch)
         slope = (images[1:] - images[:1]).reshape(num, num).T / offset[None]
         spread = covariance + jnp.diag(self._kick**2)
         covariance = slope @ spread @ slope.T

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from boomdp_jax.core.arrays import FloatScalar, IntScalar, on_device
+from boomdp_jax.core.arrays import BoolScalar, FloatScalar, IntScalar, on_device
 from boomdp_jax.inference.hypotheses.contact_prediction import (
     ContactScene,
     contact_step,
@@ -121,10 +121,16 @@ def _least_angle(angle):
 
 
 Predict = Callable[
-    [Float[Array, "body 6"], Float[Array, "body 3"], FloatScalar | None],
+    [
+        Float[Array, "body 6"],
+        Float[Array, "body 3"],
+        FloatScalar | None,
+        BoolScalar | None,
+    ],
     Float[Array, "body 6"],
 ]
-"""From channels, wrenches and a length (None: that of all steps) to channels."""
+"""From channels, wrenches, a length (None: that of all steps), and whether anything may
+touch (None: it may), to channels."""
 
 
 def predictor(
@@ -142,18 +148,43 @@ def predictor(
     """
     if dt.ndim == 0 and isinstance(scene, Scene):
         prepared = prepare_step(scene, params, dt=dt)
-        return lambda state, action, _: (
+        return lambda state, action, length, may_touch: (
             prepared(state_from_array(state), action)[0].array
         )
 
-    def predict(state, action, length):
+    def predict(state, action, length, may_touch):
         length = dt if length is None else length
         return predict_step(scene, params, state, action, length)
 
-    return predict
+    if isinstance(scene, Scene):
+        return predict
+    apart = predictor(scene.apart, params, dt)
+    return lambda state, action, length, may_touch: where_near(
+        may_touch,
+        lambda: predict(state, action, length, None),
+        lambda: apart(state, action, length, None),
+    )
 
 
-PredictChannels = Callable[[list, Float[Array, "1 3"], FloatScalar | None], list]
+def where_near(
+    may_touch: BoolScalar | None,
+    near: Callable[[], Array],
+    apart: Callable[[], Array],
+) -> Array:
+    """What holds where bodies may touch, or what costs less where they cannot.
+
+    Args:
+        may_touch: the same for all points of a batch, else both are worked out. None:
+            they may.
+        near: with contact.
+        apart: without.
+    """
+    return near() if may_touch is None else jax.lax.cond(may_touch, near, apart)
+
+
+PredictChannels = Callable[
+    [list, Float[Array, "1 3"], FloatScalar | None, BoolScalar | None], list
+]
 """The same of one body, from a list of its channels to such a list."""
 
 
@@ -171,17 +202,22 @@ def channel_predictor(
     """
     if dt.ndim == 0 and isinstance(scene, Scene):
         prepared = prepare_step(scene, params, dt=dt)
-        return lambda state, action, _: list(
+        return lambda state, action, length, may_touch: list(
             next_motion(prepared, Motion(*state), action)
         )
     predict = predictor(scene, params, dt)
-    return lambda state, action, length: _split_channels(
-        predict(_join_channels(state), action, length)
+    return lambda state, action, length, may_touch: _split_channels(
+        predict(_join_channels(state), action, length, may_touch)
     )
 
 
 Cloud = Callable[
-    [Float[Array, "point body 6"], Float[Array, "body 3"], FloatScalar | None],
+    [
+        Float[Array, "point body 6"],
+        Float[Array, "body 3"],
+        FloatScalar | None,
+        BoolScalar | None,
+    ],
     Float[Array, "point body 6"],
 ]
 """The same for an estimate and its neighbours, the estimate first."""
@@ -202,18 +238,22 @@ def cloud_predictor(
     """
     if isinstance(scene, Scene):
         predict = predictor(scene, params, dt)
-        return lambda points, action, length: jax.vmap(
-            lambda state: predict(state, action, length)
+        return lambda points, action, length, may_touch: jax.vmap(
+            lambda state: predict(state, action, length, None)
         )(points)
 
-    def predict_all(points, action, length):
-        length = dt if length is None else length
+    def near(points, action, length):
         impact = first_impact(scene, params, points[0], action, length)
         return jax.vmap(
             lambda state: contact_step(scene, params, state, action, length, impact)
         )(points)
 
-    return predict_all
+    apart = cloud_predictor(scene.apart, params, dt)
+    return lambda points, action, length, may_touch: where_near(
+        may_touch,
+        lambda: near(points, action, dt if length is None else length),
+        lambda: apart(points, action, length, None),
+    )
 
 
 def innovations(
@@ -289,7 +329,7 @@ def track_row(
     state, first_error = correct(
         state, row.first, row.first_mask, gains.first, gains.first_whitening
     )
-    state = predict(state, row.action, row.dt)
+    state = predict(state, row.action, row.dt, row.may_touch)
     state, last_error = correct(
         state, row.last, row.last_mask, gains.last, gains.last_whitening
     )
@@ -315,7 +355,7 @@ def _track_channels(predict: PredictChannels, state: list, row: TrackRow, gains:
     state, first_error = correct(
         state, row.first, row.first_mask, gains.first, gains.first_whitening
     )
-    state = predict(state, row.action, row.dt)
+    state = predict(state, row.action, row.dt, row.may_touch)
     state, last_error = correct(
         state, row.last, row.last_mask, gains.last, gains.last_whitening
     )

@@ -47,10 +47,25 @@ class Touching(NamedTuple):
     """Symmetric."""
     unknown: dict[str, Bool[np.ndarray, " body"]]
     """Bodies whose number the scene leaves open, by number."""
+    rows: Bool[np.ndarray, "time body body"] | None = None
+    """Rows of the history in which each pair may have touched, or in the one before or
+    after; None: perhaps all."""
 
     def has_unknown(self, a: int, b: int) -> bool:
         """Whether contact of two bodies depends on a number that is left open."""
         return any(bool(body[a] or body[b]) for body in self.unknown.values())
+
+    def near_rows(
+        self, bodies: tuple[int, ...], num_rows: int
+    ) -> Bool[np.ndarray, " time"]:
+        """Rows of a table in which any of some bodies may have touched something."""
+        near = np.ones(num_rows, bool)
+        if self.rows is not None:
+            known = np.any(self.rows[:, list(bodies)], axis=(1, 2))
+            near[: len(known)] = known
+            # No row of the history is there.
+            near[len(known) :] = False
+        return near
 
     def walls_of(self, spec: SceneSpec, bodies: tuple[int, ...]) -> tuple[int, ...]:
         """Static bodies that some bodies may have touched."""
@@ -104,12 +119,17 @@ def find_touching(spec: SceneSpec, history: History) -> Touching | None:
     if not np.all(readings.is_read):
         tracks.append(_between(spec, history))
     pairs = np.zeros_like(may)
+    rows = np.zeros((history.capacity, *may.shape), bool)
     for a, b in itertools.combinations(range(spec.num_bodies), 2):
         if may[a, b]:
             margin = _NUM_SDS * float(np.hypot(sd[a], sd[b]))
             near = (_is_near(spec, one, (a, b), reach, margin) for one in tracks)
             pairs[a, b] = pairs[b, a] = any(near)
-    return Touching(pairs, unknown_contact(spec))
+        if pairs[a, b]:
+            near_rows = _near_rows(spec, readings, (a, b), reach, margin)
+            rows[np.asarray(history.mask), a, b] = near_rows
+            rows[:, b, a] = rows[:, a, b]
+    return Touching(pairs, unknown_contact(spec), rows)
 
 
 class _Readings(NamedTuple):
@@ -136,7 +156,7 @@ def _is_near(
     if not np.any(use):
         return False
     place, run, reach = readings.pose[use][:, two], readings.run[use], reach[list(two)]
-    is_disc = np.array([_is_disc(spec.bodies[i]) for i in two])
+    is_disc = _are_discs(spec, two)
     # Which way a disc points is nothing, and neither is how it turns.
     place = np.where(is_disc[:, None] & [False, False, True], 0.0, place)
     off = readings.error[use][:, two]
@@ -161,15 +181,52 @@ def _is_near(
     return _comes_near(apart, place, run, reach, margin)
 
 
+def _near_rows(
+    spec: SceneSpec,
+    readings: _Readings,
+    two: tuple[int, int],
+    reach: np.ndarray,
+    margin: float,
+) -> Bool[np.ndarray, " row"]:
+    """Rows in which two bodies may have been closer than a margin [m], and next ones.
+
+    Rows that were not read in full at both ends are among them.
+    """
+    reach, is_disc = reach[list(two)], _are_discs(spec, two)
+    is_read = readings.is_read[:, two] | (is_disc[:, None] & [False, False, True])
+    whole = np.all(is_read, axis=(1, 2)).reshape(-1, 2).all(axis=1)
+    place = readings.pose[:, two].reshape(-1, 2, 2, 3)[whole]
+    place = np.where(is_disc[:, None] & [False, False, True], 0.0, place)
+    apart = _separation(spec.scene, place.reshape(-1, 2, 3), *two).reshape(-1, 2)
+    least = np.minimum(np.min(apart, axis=1), _least_between(apart.T, place, reach))
+    near = np.ones(len(whole), bool)
+    near[whole] = least < margin
+    run = readings.run.reshape(-1, 2)[:, 0]
+    same = run[1:] == run[:-1]
+    return near | np.append(near[1:] & same, False) | np.append(False, near[:-1] & same)
+
+
 def _comes_near(apart, place, run, reach, margin: float) -> bool:
     """Whether outlines may have been closer than a margin at or between readings."""
     if np.min(apart) < margin:
         return True
-    moved = np.diff(place, axis=0)
+    two = np.stack([place[:-1], place[1:]], axis=1)
+    least = _least_between((apart[:-1], apart[1:]), two, reach)
+    return bool(np.any((least < margin) & (run[1:] == run[:-1])))
+
+
+def _least_between(apart, place: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Distance of two bodies that they kept at least between two readings [m].
+
+    Args:
+        apart: distances at the first and at the second.
+        place: `[pair, reading, 2, 3]`.
+        reach: of each body [m].
+    """
+    moved = place[:, 1] - place[:, 0]
     length = np.hypot(*(moved[:, 0, :2] - moved[:, 1, :2]).T)
     turn = np.abs(moved[:, :, 2]) @ reach
-    least = 0.5 * (apart[1:] + apart[:-1] - length - turn)
-    return bool(np.any((least < margin) & (run[1:] == run[:-1])))
+    return 0.5 * (apart[0] + apart[1] - length - turn)
 
 
 def _readings(spec: SceneSpec, history: History) -> _Readings:
@@ -261,6 +318,7 @@ def _reach(body: BodySpec) -> float:
     return body.radius + float(np.max(np.hypot(*body.vertices.T), initial=0.0))
 
 
-def _is_disc(body: BodySpec) -> bool:
-    """Whether an outline is the same whichever way it points."""
-    return float(np.max(np.hypot(*body.vertices.T), initial=0.0)) == 0.0
+def _are_discs(spec: SceneSpec, bodies: tuple[int, ...]) -> Bool[np.ndarray, " body"]:
+    """Whether outlines are the same whichever way they point."""
+    vertices = (spec.bodies[i].vertices for i in bodies)
+    return np.array([np.max(np.hypot(*v.T), initial=0.0) == 0.0 for v in vertices])

@@ -28,6 +28,7 @@ class TrackRow(NamedTuple):
     dt: Float[Array, "*time"] | None
     """None where all steps are equally long."""
     weight: Float[Array, "*time"] | None
+    may_touch: Bool[Array, "*time"] | None = None
 
 
 class TrackData(eqx.Module):
@@ -54,6 +55,8 @@ class TrackData(eqx.Module):
     """As how many times its likelihood each row counts; None: as one."""
     freedom: float | None = eqx.field(static=True, default=None)
     """Degrees of freedom of the readings' Student-t noise; None: it is normal."""
+    may_touch: Bool[Array, " time"] | None = None
+    """Rows in which bodies may touch something; None: all, where there is contact."""
 
     @property
     def is_used(self) -> Bool[Array, "*batch time"]:
@@ -77,6 +80,7 @@ class TrackData(eqx.Module):
             last_mask=self.last_mask,
             dt=self.steps.dt if self.steps.dt.ndim else None,
             weight=self.weight,
+            may_touch=self.may_touch,
         )
 
 

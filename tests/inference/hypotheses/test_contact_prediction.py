@@ -59,7 +59,10 @@ def scene_of(case: Case) -> tuple[ContactScene, Params]:
         contact={"friction": friction, "restitution": restitution},
     )
     world = ContactScene(
-        spec.scene, jnp.zeros((0, 3)), sort_pairs([(0, 1)], np.array([True, True]))
+        spec.scene,
+        jnp.zeros((0, 3)),
+        sort_pairs([(0, 1)], np.array([True, True])),
+        spec.scene,
     )
     return world, spec.params()
 
@@ -156,6 +159,7 @@ def test_a_disc_bounces_off_a_wall():
         spec.scene,
         jnp.array([[1.0, 0.0, 0.0]]),
         sort_pairs([(0, 1)], np.array([True, False])),
+        spec.scene,
     )
     # The wall's face is at 0.95; the ball meets it after 0.37 of the step.
     share, speed, along, spin = 0.37, 1.2, 0.9, 3.0
