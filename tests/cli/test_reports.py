@@ -71,8 +71,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
     stand_ins = {
         "infer": {"infer": infer, "infer_batch": infer_batch},
-        "posterior": {"load_posterior": lambda path: _Posterior(0, {})},
-        "predict": {"predict": predict},
+        "posteriors.posterior": {"load_posterior": lambda path: _Posterior(0, {})},
+        "posteriors.predict": {"predict": predict},
     }
     for name, functions in stand_ins.items():
         full_name = f"boomdp_jax.inference.{name}"

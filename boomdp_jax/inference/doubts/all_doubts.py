@@ -4,6 +4,7 @@ import numpy as np
 
 from boomdp_jax.core.history import History
 from boomdp_jax.inference.doubts.angle_sense import angle_sense_reasons
+from boomdp_jax.inference.doubts.density_doubts import density_reasons
 from boomdp_jax.inference.doubts.drag_doubts import drag_reasons
 from boomdp_jax.inference.doubts.end_stops import end_stop_reasons
 from boomdp_jax.inference.doubts.known_joints import known_joint_reasons
@@ -52,6 +53,7 @@ def with_doubts(
         *known_joint_reasons(spec, history),
         *end_stop_reasons(spec, history, posterior),
         *noise_reasons(spec, history, *noise),
+        *density_reasons(spec, history, posterior),
         *lever_reasons(spec, posterior),
         *angle_reasons(spec, history, posterior),
         *stance_reasons(spec, posterior),
