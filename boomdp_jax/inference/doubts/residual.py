@@ -21,12 +21,12 @@ from boomdp_jax.inference.doubts.residual_laws import LAWS, Law, Path
 from boomdp_jax.inference.doubts.residual_regression import (
     LawFit,
     absorb,
-    correlation,
     fit_law,
-    whiteness,
+    white_by_body,
 )
 from boomdp_jax.inference.doubts.residual_spread import SpreadGrowth, spread_growth
 from boomdp_jax.inference.doubts.step_doubts import Linearised, StepError, step_error
+from boomdp_jax.inference.doubts.uneven_clock import ClockError, clock_error
 from boomdp_jax.inference.fits.fit import Host
 from boomdp_jax.inference.hypotheses.body_numbers import get_number
 from boomdp_jax.inference.hypotheses.decode import decode
@@ -35,7 +35,6 @@ from boomdp_jax.inference.likelihoods.evaluate import pushed_innovations
 from boomdp_jax.inference.likelihoods.filter_points import filter_points
 from boomdp_jax.inference.likelihoods.kalman import Filtered
 from boomdp_jax.inference.likelihoods.target import StructureTarget
-from boomdp_jax.inference.posteriors.summary import CHANNELS
 from boomdp_jax.inference.readings.track_data import TrackData
 from boomdp_jax.inference.samplers.block_draws import BlockDraws
 from boomdp_jax.physics.actuator import delayed
@@ -54,8 +53,6 @@ _MOVES = (1e-3, 3e-2)
 # Least noise of the motion that the first push is measured by, as a share of readings'.
 _LEAST_NOISE = 0.01
 _POINTS = 16
-# Mean square of standardised innovations from which their whiteness is judged.
-_LEAST_SQUARE = 0.5
 
 
 class BodyLaw(NamedTuple):
@@ -82,6 +79,8 @@ class ResidualCheck(NamedTuple):
     """Of each body, of innovations one after the other, by the same groups."""
     step: StepError | None = None
     """What finer steps would change; None: it was not asked."""
+    clock: ClockError | None = None
+    """How much steps vary in length; None: it was not asked."""
 
 
 def check_residuals(targets: StructureTarget, draws: BlockDraws) -> list[ResidualCheck]:
@@ -181,7 +180,8 @@ class _Block:
         base = self._innovations(self._z[None, None])[0, 0]
         if not np.all(np.isfinite(base)):
             return ResidualCheck(len(rows), [], [])
-        paths = self._paths(base)
+        before, after = self._states(base)
+        paths = self._paths(0.5 * (before + after))
         pushes = [
             (body, law, np.stack(law.wrench(path)))
             for body, path in enumerate(paths)
@@ -207,12 +207,14 @@ class _Block:
                 found.append(BodyLaw(body, law, fit))
         found.sort(key=lambda one: -one.fit.log_bayes_factor)
         growth = self._growth(base, counts, paths)
-        white, correlated = self._whiteness(base, counts)
+        track = np.cumsum(np.asarray(self._data.is_start) > 0)
+        white, correlated = white_by_body(base[:, 1], counts[:, 1], track)
         place = (self._targets, self._index, self._structure, self._z, self._filtered)
         known_moves = (self._used, self._is_normal, base / scale, moves, scale)
         best = Linearised(*place, self._command, *known_moves)
         step = step_error(best, self._others)
-        return ResidualCheck(len(rows), found, white, growth, correlated, step)
+        clock = self._clock(base, before, after)
+        return ResidualCheck(len(rows), found, white, growth, correlated, step, clock)
 
     def _counts(self) -> np.ndarray:
         counts = self._filtered.gains.counts
@@ -243,8 +245,8 @@ class _Block:
             z,
         )
 
-    def _paths(self, innovation: np.ndarray) -> list[Path]:
-        """Path of each body, by what is known before the end of each step is read.
+    def _states(self, innovation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """At both ends of each step, by what is known before its end is read.
 
         What is read there must not enter what it is regressed on.
         """
@@ -263,7 +265,25 @@ class _Block:
         before = before + moved(parts.first, parts.first_whitening, innovation[:, 0])
         after = np.asarray(self._filtered.after.mean, float)
         after = after - moved(parts.last, parts.last_whitening, innovation[:, 1])
-        middle = 0.5 * (before + after)
+        return before, after
+
+    def _clock(
+        self, innovation: np.ndarray, before: np.ndarray, after: np.ndarray
+    ) -> ClockError | None:
+        """Whether rows last as long as told; not asked where bodies may collide."""
+        likelihood: Any = self._targets.log_likelihood
+        if likelihood.coordinates.contact is not None:
+            return None
+        rate = (after - before) / self._dt[:, None, None]
+        rate[..., :3] = 0.5 * (before + after)[..., 3:]
+        flat = (len(rate), -1)
+        whitening = np.asarray(self._filtered.gains.last_whitening, float)
+        rate = (whitening @ rate.reshape(flat)[..., None])[..., 0]
+        return clock_error(innovation[:, 1].reshape(flat), rate, self._dt)
+
+    def _paths(self, middle: np.ndarray) -> list[Path]:
+        """Path of each body, by states half-way through each step."""
+        shape = middle.reshape(len(middle), -1, 6).shape
         variance = np.diagonal(self._filtered.after.covariance, axis1=1, axis2=2)
         spread = np.sqrt(np.asarray(variance, float)).reshape(shape)
         change = np.diff(self._wrench, axis=0, prepend=self._wrench[:1])
@@ -339,27 +359,6 @@ class _Block:
             )
             for body, path in enumerate(paths)
         )
-
-    def _whiteness(
-        self, base: np.ndarray, counts: np.ndarray
-    ) -> tuple[list[dict[str, float]], tuple[dict[str, float], ...]]:
-        track = np.cumsum(np.asarray(self._data.is_start) > 0)
-        found, correlated = [], []
-        for body in range(base.shape[2]):
-            each, both = {}, {}
-            for name, group in zip(CHANNELS, _GROUPS, strict=True):
-                channels = list(group)
-                error = base[:, 1, body, channels]
-                seen = counts[:, 1, body, channels]
-                # Readings that are better than they are taken to be need not be white.
-                is_full = np.sum(error**2) > _LEAST_SQUARE * np.sum(seen)
-                value = whiteness(error, seen, track) if is_full else None
-                if value is not None:
-                    each[name] = value
-                    both[name] = correlation(error, seen, track)
-            found.append(each)
-            correlated.append(both)
-        return found, tuple(correlated)
 
 
 def _from_edges(is_start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -27,6 +27,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from boomdp_jax.inference.posteriors.summary import CHANNELS
+
 # A law of which less than this share of its length is left is one of the model's own.
 _LEAST_LEFT = 1e-3
 # Stretches of rows that are left out in turn, and the share of a law's information
@@ -34,6 +36,9 @@ _LEAST_LEFT = 1e-3
 _NUM_STRETCHES, _LEAST_SHARE = 20, 1e-3
 # Lags over which whiteness is judged, and pairs of readings that each needs.
 _NUM_LAGS, _LEAST_PAIRS = 4, 12
+# Mean square of standardised innovations from which their whiteness is judged.
+_LEAST_SQUARE = 0.5
+_GROUPS = ((0, 1), (2,), (3, 4), (5,))
 
 
 class LawFit(NamedTuple):
@@ -195,3 +200,36 @@ def _chi_square_tail(value: float, num: int) -> float:
     for k in range(num % 2 or 2, num, 2):
         tail += math.exp(0.5 * k * math.log(half) - half - math.lgamma(0.5 * k + 1.0))
     return min(tail, 1.0)
+
+
+def white_by_body(
+    innovation: Float[np.ndarray, "time body 6"],
+    counts: Float[np.ndarray, "time body 6"],
+    track: Int[np.ndarray, " time"],
+) -> tuple[list[dict[str, float]], tuple[dict[str, float], ...]]:
+    """Whiteness and correlation of every body's readings, by channel group.
+
+    Args:
+        innovation: whitened, of the readings that end each step.
+        counts: one where something was read.
+        track: which run each step belongs to.
+
+    Returns:
+        Of each body p-values, and correlations of innovations one after the other.
+    """
+    found, correlated = [], []
+    for body in range(innovation.shape[1]):
+        each, both = {}, {}
+        for name, group in zip(CHANNELS, _GROUPS, strict=True):
+            channels = list(group)
+            error = innovation[:, body, channels]
+            seen = counts[:, body, channels]
+            # Readings that are better than they are taken to be need not be white.
+            is_full = np.sum(error**2) > _LEAST_SQUARE * np.sum(seen)
+            value = whiteness(error, seen, track) if is_full else None
+            if value is not None:
+                each[name] = value
+                both[name] = correlation(error, seen, track)
+        found.append(each)
+        correlated.append(both)
+    return found, tuple(correlated)

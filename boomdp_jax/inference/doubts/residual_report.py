@@ -9,6 +9,7 @@ from boomdp_jax.inference.doubts.evidence_report import BlockResult
 from boomdp_jax.inference.doubts.residual import BodyLaw, ResidualCheck
 from boomdp_jax.inference.doubts.residual_laws import LAWS
 from boomdp_jax.inference.doubts.step_doubts import step_reason
+from boomdp_jax.inference.doubts.uneven_clock import clock_reason
 from boomdp_jax.inference.posteriors.table import plus_minus
 from boomdp_jax.physics.scene_spec import SceneSpec
 
@@ -45,7 +46,8 @@ def report_residuals(
     together, what exceeds that by a margin is a doubt. Correlated innovations without
     such a law are a note: readings of real sensors are often not white. Where they are
     strongly correlated the draws are too sure at least, which is a doubt, and so are
-    steps that are too long (`step_doubts`). A note are readings that err more the
+    steps that are too long (`step_doubts`) or not as long as told (`uneven_clock`). A
+    note are readings that err more the
     faster a body moves.
 
     Args:
@@ -57,8 +59,9 @@ def report_residuals(
         `log_bayes_factor` of a law, the best `laws` with coefficients and their sds,
         `whiteness`, p-values by body and channel group, `correlation` of innovations
         one after the other likewise, `spread`, how errors grow with speed by body, and
-        `step_shift`, by how many posterior sds numbers would move in finer steps, None
-        where it was not asked; reasons for doubt; notes.
+        `step_shift`, by how many posterior sds numbers would move in finer steps, and
+        `clock`, by how much steps seem to vary in length, None where these were not
+        asked; reasons for doubt; notes.
     """
     checked = [result for result in results if result.residual is not None]
     num_bodies = sum(len(result.block.bodies) for result in checked)
@@ -75,6 +78,10 @@ def report_residuals(
             too_long = step_reason(check.step, names, numbers)
             reasons += [] if too_long is None else [too_long]
             step_shift = float(np.max(np.abs(check.step.shift)))
+        clock = check.clock
+        if clock is not None:
+            uneven = clock_reason(clock, names)
+            reasons += [] if uneven is None else [uneven]
         decisive: dict[int, BodyLaw] = {}
         for law in check.laws:
             if law.fit.log_bayes_factor > threshold:
@@ -135,6 +142,7 @@ def report_residuals(
                 "correlation": dict(zip(names, check.correlation, strict=False)),
                 "spread": spread,
                 "step_shift": step_shift,
+                "clock": None if clock is None else clock._asdict(),
             }
         )
     return entries, reasons, notes
