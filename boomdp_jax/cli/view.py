@@ -2,6 +2,7 @@
 
 import argparse
 import importlib.util
+import sys
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -42,14 +43,10 @@ def run(arguments: argparse.Namespace) -> None:
         films.append((path, *poses_of_episode(table, spec, arguments.episode)))
     for index, (path, poses, intervals) in enumerate(films):
         states = State(pose=jnp.asarray(poses, float), twist=jnp.zeros(poses.shape))
-        animate(
-            spec,
-            states,
-            numbered(arguments.out, index, len(films)),
-            dt=intervals,
-            fps=arguments.fps,
-            title=Path(path).stem,
-        )
+        out = numbered(arguments.out, index, len(films))
+        title = Path(path).stem
+        animate(spec, states, out, dt=intervals, fps=arguments.fps, title=title)
+        print(out, file=sys.stderr)
 
 
 def _view_run(arguments: argparse.Namespace) -> None:
@@ -70,6 +67,7 @@ def _view_run(arguments: argparse.Namespace) -> None:
         title=shown.title,
         has_trail=True,
     )
+    print(arguments.out, file=sys.stderr)
 
 
 def check_animation(path: str) -> None:

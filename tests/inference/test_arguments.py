@@ -7,7 +7,7 @@ import pytest
 import scipy.stats
 
 from boomdp_jax.core import make_history
-from boomdp_jax.inference import infer, infer_batch
+from boomdp_jax.inference import OnlineBelief, infer, infer_batch
 from boomdp_jax.inference.arguments import check_arguments, check_history
 from boomdp_jax.inference.blocks.block import make_block
 from boomdp_jax.inference.infer import padded_histories
@@ -63,6 +63,12 @@ def test_keys_lists_and_meshes_are_told_apart():
         ValueError, match=r"histories: expected one per scene, 1, got 2"
     ):
         infer_batch(KEY, [SPEC], [rows, rows])
+
+
+def test_a_belief_that_is_begun_without_a_key_is_refused(no_type_checks):
+    belief = OnlineBelief(SPEC, capacity=32)
+    with pytest.raises(TypeError, match=r"key: expected one such as .*; got 0"):
+        belief.init(0)
 
 
 @pytest.mark.parametrize(

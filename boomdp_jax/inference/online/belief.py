@@ -27,7 +27,7 @@ from boomdp_jax.core.arrays import BoolScalar, Key, on_device
 from boomdp_jax.core.checked_input import positive_seconds, whole_number
 from boomdp_jax.core.compile_ahead import signature
 from boomdp_jax.core.history import History
-from boomdp_jax.inference.arguments import check_history
+from boomdp_jax.inference.arguments import check_history, check_key
 from boomdp_jax.inference.doubts.all_doubts import with_doubts
 from boomdp_jax.inference.online.check import check_online
 from boomdp_jax.inference.online.file import (
@@ -86,7 +86,7 @@ class OnlineBelief:
     counts $\lambda^n$ times, so that the prior comes back where nothing new is learnt.
     The state is not forgotten: older pushes tell through today's velocity, and sds are
     below those of `infer` on the last $1 / (1 - \lambda)$ rows: 1.5 to 3 times, of a
-    free box's mass at 0.95. They do not allow for what changes within those or so.
+    box's mass at 0.95. Changes within twice that are not allowed for, or found late.
     """
 
     def __init__(
@@ -172,6 +172,7 @@ class OnlineBelief:
             ValueError: a history of another number of bodies, of more transitions than
                 the capacity, or of steps of another length.
         """
+        check_key(key)
         table, num_rows = self._empty, 0
         if history is not None:
             check_history(self.spec, history)
@@ -215,11 +216,11 @@ class OnlineBelief:
 
         Args:
             belief: so far.
-            state: reading before the step; NaN marks what is missing.
+            state: reading before the step; what is not finite is missing.
             wrench: at the centres of mass, held over the step [N, N, N m]. If it is not
                 finite, or the length turns out not to be positive and finite under
                 `jit`, the transition tells nothing; info says so.
-            next_state: reading after the step, NaN where missing.
+            next_state: reading after the step, likewise.
             dt: length of the step [s], if lengths vary.
             starts_episode: whether bodies were moved otherwise since the last
                 transition.
