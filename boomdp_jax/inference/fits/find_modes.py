@@ -22,7 +22,13 @@ from boomdp_jax.inference.fits.fit import (
     join_fits,
     make_fits,
 )
-from boomdp_jax.inference.fits.fit_noise import NoisePeaks, fit_noise, with_gains
+from boomdp_jax.inference.fits.fit_noise import (
+    Density,
+    NoiseDensity,
+    NoisePeaks,
+    fit_noise,
+    with_gains,
+)
 from boomdp_jax.inference.fits.fit_search import search_further
 from boomdp_jax.inference.fits.fit_starts import Guesses, first_fits, grown_fits
 from boomdp_jax.inference.fits.floor_starts import with_other_floors
@@ -32,8 +38,13 @@ from boomdp_jax.inference.likelihoods.evaluate import evaluate_points
 from boomdp_jax.inference.likelihoods.exact_starts import ExactStarts, with_open_loop
 from boomdp_jax.inference.likelihoods.target import StructureTarget
 
-# Rounds of noise, gains and fit.
-_NUM_ROUNDS = 2
+# Rounds of noise, gains and fit, at least and at most: until no structure that may
+# count gains so much by noise of where its fit is now. With poses alone first fits are
+# poor, and what they miss passes for noise of the motion. Two structures of one motion
+# (a pin's friction, and a wheel's) were told apart by six nats after two rounds, which
+# nothing later mends, as the one got no draws; after three by a tenth.
+_FEWEST_ROUNDS, _MOST_ROUNDS = 2, 6
+_SETTLED, _MAY_COUNT = 0.5, 20.0
 # Noise starts too high rather than too low: readings at so many times the residuals of
 # single steps, impulses at those residuals.
 _START_NOISE = 3.0
@@ -49,6 +60,8 @@ _HOPELESS = 40.0
 _LACK = 0.5
 # Sds by which gains take the motion's noise to be above its peak.
 _WIDENING = 1.0
+# Shares of that which are tried.
+_SHARES = (0.1, 0.2, 0.35, 0.5, 0.7, 0.85, 1.0)
 
 
 class Found(NamedTuple):
@@ -85,19 +98,30 @@ def find_modes(
     report("fitting single steps")
     fits, lack = _single_step_fits(rng, single, guesses, settings)
     noise = _first_noise(single, best_of_each(fits, num_structures, 1))
-    for number in range(_NUM_ROUNDS):
-        report(f"fitting noise and filters, round {number + 1} of {_NUM_ROUNDS}")
+    is_open = np.ones(len(targets.structures), bool)
+    for number in range(_MOST_ROUNDS):
+        report(f"fitting noise and filters, round {number + 1}")
         top = best_of_each(fits, num_structures, 1)
-        noise = _noise_of_structures(targets, top, noise, number > 0)
-        targets = with_gains(targets, top, noise)
-        again = make_fits(targets, fits.index, fits.structure, fits.z)
+        found = _noise_of_structures(targets, top, noise, number > 0)
+        if number >= _FEWEST_ROUNDS:
+            is_open &= found.gain > _SETTLED
+            if not is_open.any():
+                break
+        rows = np.repeat(is_open, num_structures)
+        noise = found.noise.where(rows, noise)
+        targets = with_gains(targets, top.take(rows), noise.take(rows))
+        mine = is_open[fits.index]
+        again = make_fits(
+            targets, *(part[mine] for part in (fits.index, fits.structure, fits.z))
+        )
         again = best_of_each(again, num_structures, settings.num_starts)
-        if number > 0:
-            # Gains have changed a little, and what there is to find has been found.
-            fits = climb(targets, again, settings.num_repeats, lack)
-            fits = with_other_floors(targets, fits)
+        if number == 0:
+            fits = _climbed(rng, targets, guesses, again, settings, lack)
             continue
-        fits = _climbed(rng, targets, guesses, again, settings, lack)
+        # Gains have changed a little, and what there is to find has been found.
+        again = climb(targets, again, settings.num_repeats, lack)
+        again = with_other_floors(targets, again)
+        fits = join_fits(fits.take(~mine), again)
     modes = collect_modes(targets, fits, settings.num_modes, lack)
     return Found(targets, modes, noise)
 
@@ -211,9 +235,18 @@ def _first_noise(targets: StructureTarget, top: Fits) -> NoiseFit:
     return start.take(np.repeat(np.arange(num_objects), num_structures))
 
 
+class _NoiseFound(NamedTuple):
+    """Noise of every structure of every object, in order."""
+
+    noise: NoiseFit
+    gain: np.ndarray
+    """By how much it is likelier than what was there before, of each object the most
+    among structures that may count [nat]."""
+
+
 def _noise_of_structures(
     targets: StructureTarget, top: Fits, start: NoiseFit, has_filters: bool
-) -> NoiseFit:
+) -> _NoiseFound:
     """Noise of the most probable structures; the others get that of the best.
 
     Structures that are out of the question do not get their own either, once there are
@@ -235,27 +268,53 @@ def _noise_of_structures(
     is_asked[:, 0] = True
     chosen = np.arange(num_objects)[:, None] * num_structures + order
     rows = chosen[is_asked]
-    peaks = fit_noise(targets, top.take(rows), start.take(rows))
+    fitted = top.take(rows)
+    peaks = fit_noise(targets, fitted, start.take(rows))
     vector = start.vector.reshape(num_objects, num_structures, -1)
     out = vector.reshape(len(top.z), -1).copy()
-    out[rows] = peaks.noise.vector + _widening(peaks)
+    density = NoiseDensity(targets, fitted)
+    out[rows] = _widened(density, peaks)
+    both = np.stack([start.take(rows).vector, out[rows]], axis=1)
+    before, after = density(np.arange(len(rows)), both).T
+    gain = np.zeros(len(rows))
+    np.subtract(after, before, out=gain, where=np.isfinite(after))
+    counts = gap[is_asked] < _MAY_COUNT
+    most = np.zeros(num_objects)
+    np.maximum.at(most, rows[counts] // num_structures, gain[counts])
     best = out[chosen[:, 0]]
     out = out.reshape(vector.shape)
     is_left = np.ones(evidence.shape, bool)
     is_left.reshape(-1)[rows] = False
     out = np.where(is_left[..., None], best[:, None], out)
-    return NoiseFit.of_vector(out.reshape(len(top.z), -1))
+    return _NoiseFound(NoiseFit.of_vector(out.reshape(len(top.z), -1)), most)
 
 
-def _widening(peaks: NoisePeaks) -> np.ndarray:
-    """How far above its peak the motion's noise is taken, `[fit, number]`.
+def _widened(density: Density, peaks: NoisePeaks) -> np.ndarray:
+    """Noise with the motion's somewhat above its peak, `[fit, number]`, logarithms.
 
     Fixed gains leave out that it is uncertain. Taken at its peak they give numbers too
     little spread for a short recording, which weights could not make good later.
+
+    So many sds cost as much density as they would if it were normal, and no more: of
+    motion that shows no noise it is flat on one side and falls steeply on the other.
+    Structures that lost unlike amounts would be compared by those, and ones without
+    draws are not compared again.
     """
     sd = np.sqrt(np.diagonal(np.linalg.inv(peaks.precision), axis1=1, axis2=2))
     number = np.arange(sd.shape[1]) % NUM_EACH
-    return np.where(number >= 4, _WIDENING * sd, 0.0)
+    wide = np.where(number >= 4, _WIDENING * sd, 0.0)
+    peak, shares = peaks.noise.vector, np.array(_SHARES)
+    tries = peak[:, None] + shares[:, None] * wide[:, None]
+    value = density(np.arange(len(peak)), tries)
+    with np.errstate(invalid="ignore"):
+        drop = peaks.log_density[:, None] - value
+    # Where nothing is finite nothing is lost either.
+    drop = np.where(np.isnan(drop), 0.0, np.minimum(drop, 1e9))
+    drop = np.maximum.accumulate(np.column_stack([0.0 * drop[:, :1], drop]), axis=1)
+    most = 0.5 * np.einsum("fi,fij,fj->f", wide, peaks.precision, wide)
+    known = np.append(0.0, shares)
+    share = [np.interp(*each, known) for each in zip(most, drop, strict=True)]
+    return peak + np.array(share)[:, None] * wide
 
 
 def _laplace_evidence(targets: StructureTarget, top: Fits) -> np.ndarray:

@@ -43,6 +43,14 @@ class NoiseFit(NamedTuple):
         """Some of them."""
         return NoiseFit(self.reading[rows], self.impulse[rows])
 
+    def where(self, rows: np.ndarray, others: "NoiseFit") -> "NoiseFit":
+        """Some of them, and elsewhere those of another list."""
+        each = rows[:, None, None]
+        return NoiseFit(
+            np.where(each, self.reading, others.reading),
+            np.where(each, self.impulse, others.impulse),
+        )
+
 
 def log_noise_prior(scale: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """Log-density of the logarithms.
