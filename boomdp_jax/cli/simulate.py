@@ -51,6 +51,7 @@ def run(arguments: argparse.Namespace) -> None:
     with jax.enable_x64(True):
         spec = load_scene(arguments.scene)
         print_notes(spec.notes)
+        _check_prior(spec)
         actions = load_actions(arguments.actions, spec)
         params, substeps = _load_params(arguments, spec)
         params = spec.with_surface(params)
@@ -207,6 +208,14 @@ def _load_params(
         )
     params = jax.tree.map(lambda leaf: leaf[draw], posterior.params)
     return params, posterior.spec.substeps
+
+
+def _check_prior(spec: SceneSpec) -> None:
+    """Refuse what inference from the recording would, before there is one."""
+    if spec.prior:
+        from boomdp_jax.inference.hypotheses.prior import read_prior
+
+        read_prior(spec.prior, spec.source)
 
 
 def _defaults(spec: SceneSpec) -> list[str]:

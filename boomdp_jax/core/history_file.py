@@ -208,9 +208,14 @@ def warn_of_other_dt(dt: np.ndarray, spec: ObservedScene, source: str) -> None:
     """
     is_other = np.abs(dt - spec.dt) > _DT_TOLERANCE * spec.dt
     if np.any(is_other):
+        length = f"{dt[is_other][0]:.6g} s overrides"
+        if np.ptp(dt) > _DT_TOLERANCE * spec.dt:
+            length = (
+                f"{np.min(dt):.6g} to {np.max(dt):.6g} s (median {np.median(dt):.6g} "
+                "s) override"
+            )
         warnings.warn(
-            f"{source}: dt: {dt[is_other][0]:.6g} s overrides the scene's "
-            f"{spec.dt:.6g} s",
+            f"{source}: dt: {length} the scene's {spec.dt:.6g} s",
             stacklevel=3,
         )
 

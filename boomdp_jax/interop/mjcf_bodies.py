@@ -48,10 +48,11 @@ def read_bodies(
                     entries.append(entry)
                     owners[geom] = entry["name"]
             continue
+        got = str(len(geoms))
         if len(geoms) > 1:
-            geoms = solid
+            geoms, got = solid, f"{got} of which {len(solid)} can touch others"
         if len(geoms) != 1:
-            document.refuse("body", body, "one geom for its outline", len(geoms))
+            document.refuse("body", body, "one geom for its outline", got)
         entry = _moving(document, body, geoms[0], inertia_tolerance)
         entries.append(entry)
         owners[geoms[0]] = entry["name"]
@@ -74,10 +75,10 @@ def touching_pairs(document: Document) -> dict[tuple[int, int], int]:
     Returns:
         For each pair in order the number of its element `pair`, or -1.
     """
-    model, flags = document.model, document.mujoco.mjtDisableBit
-    if model.opt.disableflags & flags.mjDSBL_CONTACT.value:
+    model = document.model
+    if document.is_off("contact"):
         return {}
-    has_filter = not model.opt.disableflags & flags.mjDSBL_FILTERPARENT.value
+    has_filter = not document.is_off("filterparent")
     excluded = set(model.exclude_signature.tolist())
     found = {}
     for j in range(model.ngeom):

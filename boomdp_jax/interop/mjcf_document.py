@@ -119,6 +119,22 @@ class Document:
             self.refuse(kind, index, "a frame whose z axis is the world's", axis)
         return float(np.arctan2(matrix[3], matrix[0]))
 
+    def is_off(self, flag: str) -> bool:
+        """Whether the document disables something.
+
+        Args:
+            flag: as the element `flag` calls it.
+        """
+        bits = self.mujoco.mjtDisableBit.__members__
+        names = [f"mjDSBL_{flag.upper()}"]
+        if flag in ("equality", "frictionloss", "limit", "contact"):
+            names.append("mjDSBL_CONSTRAINT")
+        if flag in ("spring", "damper"):
+            # Of versions that disable both together.
+            names.append("mjDSBL_PASSIVE")
+        mask = sum(int(bits[name].value) for name in names if name in bits)
+        return bool(self.model.opt.disableflags & mask)
+
     def is_static(self, body: int) -> bool:
         """Whether a body has no joint between it and the world."""
         return bool(self.model.body_weldid[body] == 0)

@@ -2,15 +2,20 @@
 
 import math
 import os
+from typing import Any
 
 import numpy as np
 
 from boomdp_jax.interop.mjcf_bodies import read_bodies, touching_pairs
 from boomdp_jax.interop.mjcf_document import Document
-from boomdp_jax.interop.mjcf_elements import restitution_of
+from boomdp_jax.interop.mjcf_elements import SOFT_STEPS, restitution_of
 from boomdp_jax.interop.mjcf_joints import check_joint_kinds, read_joints
+from boomdp_jax.interop.mjcf_softness import check_hard
 from boomdp_jax.interop.mjcf_ties import read_equalities, read_floor
 from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
+
+_MOST_MARGIN = 1e-3
+"""By how much surfaces may stand out from their outlines [m]."""
 
 
 def from_mjcf(
@@ -26,7 +31,13 @@ def from_mjcf(
     motors, wheels and feet, contact with its friction, gravity, and the start, from a
     key frame `start` if there is one. An upright plane becomes a static box, 1 m thick
     and 100 m long if it is infinite. Left out is what has no effect without control:
-    sensors, cameras, lights, direct drives.
+    sensors, cameras, lights, direct drives; and what the document itself disables, by
+    flags of `option` and `actuatorgroupdisable`.
+
+    Ends of ranges, equalities, contact and dry friction of joints are taken as hard.
+    MuJoCo's own give way a little, and are refused where their `solref` and `solimp`
+    make them much softer than its default (a time constant above 0.04 s instead of
+    0.02 s), or let ends throw back.
 
     Args:
         source: a path, or the document itself, which begins with "<".
@@ -68,26 +79,45 @@ def from_mjcf(
 
 def _read_world(document: Document) -> np.ndarray:
     """Gravity, and that there is nothing in the world that has no place here."""
-    model, flags = document.model, document.mujoco.mjtDisableBit
+    model = document.model
     where = f"{document.source}: option"
-    for field, value in (
-        ("density 0", model.opt.density),
-        ("viscosity 0", model.opt.viscosity),
-        ("no flex", model.nflex),
-        ("tendons without stiffness", model.tendon_stiffness),
-        ("tendons without damping", model.tendon_damping),
-        ("tendons without friction", model.tendon_frictionloss),
-        ("tendons without range", model.tendon_limited),
+    for field, flag, value in (
+        ("density 0", None, model.opt.density),
+        ("viscosity 0", None, model.opt.viscosity),
+        ("no flex", None, model.nflex),
+        ("tendons without stiffness", "spring", _of_tendons(model, "stiffness")),
+        ("tendons without damping", "damper", _of_tendons(model, "damping")),
+        ("tendons without friction", "frictionloss", model.tendon_frictionloss),
+        ("tendons without range", "limit", model.tendon_limited),
+        ("tendons without armature", None, _of_tendons(model, "armature")),
     ):
-        if np.any(value):
+        if np.any(value) and not (flag and document.is_off(flag)):
             raise ValueError(f"{where}: expected {field}, got {np.max(value)}")
+    enabled, flags = model.opt.enableflags, document.mujoco.mjtEnableBit
+    if enabled & flags.mjENBL_OVERRIDE.value and touching_pairs(document):
+        raise ValueError(
+            f"{where}: expected no flag override where bodies touch, got it enabled"
+        )
+    if hasattr(flags, "mjENBL_SLEEP") and enabled & flags.mjENBL_SLEEP.value:
+        asleep = document.mujoco.mjtSleepPolicy.mjSLEEP_INIT.value
+        if np.any(model.tree_sleep_policy == asleep):
+            raise ValueError(
+                f"{where}: expected no flag sleep where bodies start asleep, got it "
+                "enabled"
+            )
     if model.opt.gravity[2] > 0.0:
         raise ValueError(
             f"{where}: expected no gravity upwards, got {model.opt.gravity}"
         )
-    if model.opt.disableflags & flags.mjDSBL_GRAVITY.value:
+    if document.is_off("gravity"):
         return np.zeros(3)
     return model.opt.gravity
+
+
+def _of_tendons(model: Any, field: str) -> np.ndarray:
+    """A number of every tendon, and those of higher order that newer MuJoCo has."""
+    names = (f"tendon_{field}", f"tendon_{field}poly")
+    return np.concatenate([np.ravel(getattr(model, name, ())) for name in names])
 
 
 def _read_step(document: Document) -> float:
@@ -169,3 +199,21 @@ def _check_pair(document: Document, i: int, j: int, pair: int) -> None:
         if not math.isclose(ours, theirs, rel_tol=1e-6, abs_tol=1e-12):
             expected = f"a {field} with {document.name('geom', j)!r} of {ours:.6g}"
             document.refuse("geom", i, expected, f"{theirs:.6g}")
+    if pair >= 0:
+        _check_surface(document, "pair", pair)
+    else:
+        for geom in (i, j):
+            _check_surface(document, "geom", geom)
+
+
+def _check_surface(document: Document, kind: str, index: int) -> None:
+    """Contact begins where outlines meet, and is hard."""
+    model = document.model
+    margin = float(getattr(model, f"{kind}_margin")[index])
+    if margin > _MOST_MARGIN:
+        document.refuse(kind, index, f"a margin of at most {_MOST_MARGIN}", margin)
+    solref = getattr(model, f"{kind}_solref")[index]
+    # As two negative numbers they are a restitution.
+    if solref[0] > 0.0:
+        solimp = getattr(model, f"{kind}_solimp")[index]
+        check_hard(document, kind, index, "", solref, solimp, most_steps=SOFT_STEPS)

@@ -6,6 +6,7 @@ import numpy as np
 
 from boomdp_jax.interop.mjcf_document import Document, wrapped
 from boomdp_jax.interop.mjcf_elements import FAR
+from boomdp_jax.interop.mjcf_softness import check_hard
 from boomdp_jax.physics.friction import KNEE_SPEED
 
 _FREE = ("slide", "slide", "hinge")
@@ -82,8 +83,12 @@ def _check_joint(document: Document, joint: int) -> None:
     if kind == "slide":
         document.direction("joint", joint, data.xaxis[joint])
     dof = int(model.jnt_dofadr[joint])
+    stiffness = [model.jnt_stiffness[joint]]
+    if hasattr(model, "jnt_stiffnesspoly"):
+        stiffness += model.jnt_stiffnesspoly[joint].tolist()
+    bent = [number for number in stiffness if number and not document.is_off("spring")]
     for field, value in (
-        ("stiffness", model.jnt_stiffness[joint]),
+        ("stiffness", bent[0] if bent else 0.0),
         ("armature", model.dof_armature[dof]),
         ("gravity compensation", model.jnt_actgravcomp[joint]),
         ("force limit", model.jnt_actfrclimited[joint]),
@@ -94,21 +99,34 @@ def _check_joint(document: Document, joint: int) -> None:
 
 def _check_free(document: Document, body: int, joints: list[int]) -> None:
     """Nothing acts in the joints of a body that is free in the plane."""
-    model, data = document.model, document.data
+    data = document.data
     slides = [j for j in joints if _kind(document, j) == "slide"]
     one, other = (data.xaxis[joint] for joint in slides)
     if abs(one[0] * other[1] - one[1] * other[0]) < 1e-6:
         document.refuse("body", body, "slides along two directions", one.tolist())
     for joint in joints:
-        dof = int(model.jnt_dofadr[joint])
+        damping, loss, is_limited = _passive(document, joint)
         for field, value in (
-            ("damping", model.dof_damping[dof]),
-            ("frictionloss", model.dof_frictionloss[dof]),
-            ("range", model.jnt_limited[joint]),
+            ("damping", damping),
+            ("frictionloss", loss),
+            ("range", is_limited),
         ):
             if value:
                 expected = f"no {field} in a body that is free in the plane"
                 document.refuse("joint", joint, expected, value)
+
+
+def _passive(document: Document, joint: int) -> tuple[float, float, bool]:
+    """Damping, friction and whether there is a range, of what is not disabled."""
+    model = document.model
+    dof = int(model.jnt_dofadr[joint])
+    damping, loss = float(model.dof_damping[dof]), float(model.dof_frictionloss[dof])
+    if document.is_off("damper"):
+        damping = 0.0
+    elif np.any(getattr(model, "dof_dampingpoly", np.zeros((dof + 1, 1)))[dof]):
+        document.refuse("joint", joint, "linear damping", model.dof_dampingpoly[dof])
+    is_limited = bool(model.jnt_limited[joint]) and not document.is_off("limit")
+    return damping, 0.0 if document.is_off("frictionloss") else loss, is_limited
 
 
 def _pin(document: Document, body: int, joint: int) -> dict:
@@ -167,9 +185,10 @@ def _laws(document: Document, joint: int, sign: float, zero: float) -> dict:
     """Friction, range and motor of a joint whose coordinate is sign * (x - zero)."""
     model = document.model
     dof = int(model.jnt_dofadr[joint])
-    damping, loss = float(model.dof_damping[dof]), float(model.dof_frictionloss[dof])
-    if np.any(model.dof_dampingpoly[dof]):
-        document.refuse("joint", joint, "linear damping", model.dof_dampingpoly[dof])
+    damping, loss, is_limited = _passive(document, joint)
+    if loss:
+        solref, solimp = model.dof_solref[dof], model.dof_solimp[dof]
+        check_hard(document, "joint", joint, "friction", solref, solimp)
     laws = [{"viscous": damping}] if damping else []
     laws += [{"dry": loss}] if loss else []
     motors: list[dict] = []
@@ -202,8 +221,10 @@ def _laws(document: Document, joint: int, sign: float, zero: float) -> dict:
     entry: dict = {}
     for law in laws + motors:
         entry |= law
-    if model.jnt_limited[joint]:
-        ends = sorted(sign * model.jnt_range[joint] + zero)
+    if is_limited:
+        # Ends take hold where their margin begins.
+        margin = float(model.jnt_margin[joint]) * np.array([1.0, -1.0])
+        ends = sorted(sign * (model.jnt_range[joint] + margin) + zero)
         near = [abs(end) < FAR * (1.0 - 1e-6) for end in ends]
         names = ("lower", "upper")
         entry |= {
@@ -211,6 +232,10 @@ def _laws(document: Document, joint: int, sign: float, zero: float) -> dict:
             for name, end, is_near in zip(names, ends, near, strict=True)
             if is_near
         }
+        if any(near):
+            solref, solimp = model.jnt_solref[joint], model.jnt_solimp[joint]
+            args = (document, "joint", joint, "limit", solref, solimp)
+            check_hard(*args, is_stop=True)
     return entry
 
 
@@ -225,14 +250,28 @@ def velocity_law(
 
     Returns:
         Force per speed, limit, force at rest; None for a force that follows a control
-        alone, which is no part of a scene.
+        alone, which is no part of a scene, and for what the document disables.
 
     Raises:
-        ValueError: it is a servo.
+        ValueError: it is a servo, adds to the inertia or damping of what it drives, or
+            has to push without a control.
     """
     model, mujoco = document.model, document.mujoco
+    for field in ("armature", "damping", "dampingpoly"):
+        added = getattr(model, f"actuator_{field}", np.zeros(model.nu))[actuator]
+        is_gone = field != "armature" and document.is_off("damper")
+        if np.any(added) and not is_gone:
+            document.refuse("actuator", actuator, f"no {field}", added)
+    group = int(model.actuator_group[actuator])
+    is_off = 0 <= group <= 30 and model.opt.disableactuator & 1 << group
+    if is_off or document.is_off("actuation"):
+        return None
     bias = int(model.actuator_biastype[actuator])
     if bias == mujoco.mjtBias.mjBIAS_NONE.value:
+        low, high = (float(n) for n in model.actuator_ctrlrange[actuator])
+        is_clamped = model.actuator_ctrllimited[actuator]
+        if is_clamped and not low <= 0.0 <= high and not document.is_off("clampctrl"):
+            document.refuse("actuator", actuator, "a ctrlrange about 0", (low, high))
         return None
     constant, place, speed = (float(n) for n in model.actuator_biasprm[actuator, :3])
     is_free = not np.any(model.actuator_gainprm[actuator])

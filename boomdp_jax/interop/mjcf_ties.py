@@ -7,6 +7,7 @@ import numpy as np
 from boomdp_jax.interop.mjcf_document import Document, wrapped
 from boomdp_jax.interop.mjcf_elements import FOOT_ANGLES, FOOT_LIMIT, FOOT_VISCOUS
 from boomdp_jax.interop.mjcf_joints import velocity_law
+from boomdp_jax.interop.mjcf_softness import check_hard
 from boomdp_jax.physics.shapes import foot_loads
 
 _UNLIMITED = 1e12
@@ -30,7 +31,7 @@ def read_equalities(document: Document) -> list[dict]:
     entries = []
     for index in range(model.neq):
         kind = int(model.eq_type[index])
-        if not model.eq_active0[index]:
+        if not model.eq_active0[index] or document.is_off("equality"):
             continue
         if kind == kinds.mjEQ_TENDON.value:
             entries.append(_rod(document, index))
@@ -40,6 +41,8 @@ def read_equalities(document: Document) -> list[dict]:
         else:
             name = kinds(kind).name.removeprefix("mjEQ_").lower()
             document.refuse("equality", index, "connect, weld or one tendon", name)
+        solref, solimp = model.eq_solref[index], model.eq_solimp[index]
+        check_hard(document, "equality", index, "", solref, solimp)
     return entries
 
 
@@ -47,6 +50,8 @@ def _tie(document: Document, index: int, is_weld: bool) -> dict:
     """A pin or a weld, between bodies or sites."""
     model, mujoco = document.model, document.mujoco
     numbers = model.eq_data[index]
+    if is_weld and numbers[10] <= 0.0:
+        document.refuse("equality", index, "a torquescale above 0", numbers[10])
     ids = int(model.eq_obj1id[index]), int(model.eq_obj2id[index])
     if model.eq_objtype[index] == mujoco.mjtObj.mjOBJ_SITE.value:
         a, b = (int(model.site_bodyid[site]) for site in ids)

@@ -327,9 +327,25 @@ def _check_body(body: BodySpec, where: str) -> None:
         refuse(f"{where}: pose", "a pose, as the body is static", None)
     if body.is_static and np.any(body.twist != 0):
         refuse(f"{where}: twist", "zeros, as the body is static", body.twist.tolist())
+    if body.center_of_mass is not None and not _is_inside(body):
+        refuse(
+            f"{where}: center_of_mass",
+            "a point of the outline, as no part of a body has a negative mass",
+            body.center_of_mass.tolist(),
+        )
     if body.kind == "circle" and np.any(body.shift != 0):
         refuse(
             f"{where}: center_of_mass",
             "[0, 0], the centre of the circle (or a polygon for the shape)",
             body.shift.tolist(),
         )
+
+
+def _is_inside(body: BodySpec) -> bool:
+    """Whether the centre of mass that is given lies in the outline, or all but."""
+    if body.kind == "circle":
+        return True
+    edges = np.roll(body.outline, -1, axis=0) - body.outline
+    to_center = body.shift - body.outline
+    outside = edges[:, 1] * to_center[:, 0] - edges[:, 0] * to_center[:, 1]
+    return bool(np.all(outside <= 1e-6 * body.reach * np.hypot(*edges.T)))

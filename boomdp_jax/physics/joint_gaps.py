@@ -49,6 +49,30 @@ def joint_gaps(
     return gaps
 
 
+def joint_travel(
+    kind: str,
+    numbers: Mapping[str, np.ndarray],
+    pose_a: Float[np.ndarray, "pose 3"],
+    pose_b: Float[np.ndarray, "pose 3"],
+) -> tuple[Float[np.ndarray, " pose"], str]:
+    """Where a pin or a drawer is, at many poses, in what its range is given in.
+
+    Args:
+        kind: revolute or prismatic.
+        numbers: by the names of the kind's class in `physics.params`.
+        pose_a: of its first body.
+        pose_b: of its second; that of the world is zeros.
+
+    Returns:
+        How far it has turned [rad], whole turns included, or slid [m]; and the unit.
+    """
+    if kind == "revolute":
+        return pose_a[:, 2] - pose_b[:, 2], "rad"
+    offset = _placed(pose_a, numbers["anchor_a"]) - _placed(pose_b, numbers["anchor_b"])
+    angle = pose_b[:, 2] + float(numbers["axis"])
+    return np.cos(angle) * offset[:, 0] + np.sin(angle) * offset[:, 1], "m"
+
+
 def _placed(
     pose: Float[np.ndarray, "pose 3"], anchor: np.ndarray
 ) -> Float[np.ndarray, "pose 2"]:

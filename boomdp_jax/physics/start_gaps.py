@@ -1,4 +1,4 @@
-"""Whether bodies start where their joints hold them; the first step moves them there.
+"""Whether bodies start where their joints let them be; the first step moves them there.
 
 A recording that begins with such a jump looks as if something had hit the bodies.
 """
@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from boomdp_jax.physics.constraint_spec import JOINTS
-from boomdp_jax.physics.joint_gaps import JOINT_WORDS, joint_gaps
+from boomdp_jax.physics.joint_gaps import JOINT_WORDS, joint_gaps, joint_travel
 from boomdp_jax.physics.params import WORLD, Params
 from boomdp_jax.physics.state import State
 
@@ -26,8 +26,8 @@ def start_gaps(params: Params, state: State, names: Sequence[str]) -> list[str]:
         names: of the bodies.
 
     Returns:
-        A clause for each joint that is off by more than `START_TOLERANCE`, in the
-        order of the joints.
+        A clause for each joint that is off, or outside its range, by more than
+        `START_TOLERANCE`, in the order of the joints.
     """
     pose = np.asarray(state.pose, float)
     clauses = []
@@ -53,4 +53,15 @@ def start_gaps(params: Params, state: State, names: Sequence[str]) -> list[str]:
                         f"body {names[own]!r} starts {size:.3g} {unit} off its "
                         f"{JOINT_WORDS[kind]} to {partner}"
                     )
+            limit = getattr(joints, "limit", None)
+            if limit is None:
+                continue
+            travel, unit = joint_travel(kind, numbers, pose[own][None], to_b[None])
+            lower, upper = limit[slot]
+            size = float(max(lower - travel[0], travel[0] - upper))
+            if size > START_TOLERANCE:
+                clauses.append(
+                    f"body {names[own]!r} starts {size:.3g} {unit} outside the range "
+                    f"of its {JOINT_WORDS[kind]} to {partner}"
+                )
     return clauses

@@ -231,6 +231,36 @@ def test_a_start_off_a_joint_is_told(folder: Path, capsys: pytest.CaptureFixture
     assert _notes(capsys) == [f"scene.json: pose: {off}"]
 
 
+def test_a_start_outside_a_range_is_told(folder: Path, capsys: pytest.CaptureFixture):
+    pin = {"type": "revolute", "a": "box", "b": "world", "anchor_a": [0, 0]}
+    _change_scene(constraints=[pin | {"anchor_b": [1, 2], "lower": -0.5, "upper": 0.5}])
+    start = np.zeros((2, 6))
+    start[1, :3] = [1.0, 2.0, 0.6]
+    np.savez("a.npz", action=_action(1, (0.0, 0.0, 0.0)), initial_state=start)
+    _simulate()
+    assert _notes(capsys) == [
+        "a.npz: initial_state: body 'box' starts 0.1 rad outside the range of its pin "
+        "to the world; the first step takes it there"
+    ]
+    table = load_transitions("out.npz")
+    np.testing.assert_allclose(table.next_state[0, 1, 2], 0.5, atol=1e-6)
+
+
+def test_a_prior_of_unknown_names_is_refused(
+    folder: Path, capsys: pytest.CaptureFixture
+):
+    np.savez("a.npz", action=_action(1, (0.0, 0.0, 0.0)))
+    command = "simulate scene.json --actions a.npz --out out.npz"
+    _change_scene(prior={"nonsense": 1})
+    assert main(command.split()) == 2
+    error = capsys.readouterr().err
+    assert "scene.json: prior: expected one of density" in error
+    assert "got 'nonsense'" in error
+    assert not Path("out.npz").exists()
+    _change_scene(prior={"density": {"center": 20.0}})
+    _simulate()
+
+
 @pytest.mark.parametrize(("told", "expected"), [({}, 5), ({"substeps": 3}, 3)])
 def test_a_draw_is_moved_in_the_parts_that_it_was_inferred_with(
     folder: Path, told: dict, expected: int

@@ -121,6 +121,15 @@ def test_another_step_length_warns_and_holds(tmp_path: Path):
     np.testing.assert_allclose(history.dt, 0.01)
 
 
+def test_step_lengths_that_vary_warn_of_all_of_them(tmp_path: Path):
+    dt = np.array([0.056, 0.015, 0.02, 0.03, 0.08, 0.02])
+    path = _write(tmp_path / "data.npz", dt=dt)
+    message = r"dt: 0\.015 to 0\.08 s \(median 0\.025 s\) override the scene's 0\.02 s"
+    with pytest.warns(UserWarning, match=message):
+        history = load_history(path, spec=_Scene())
+    np.testing.assert_allclose(history.dt, dt)
+
+
 def test_an_array_of_unknown_name_warns(tmp_path: Path):
     path = _write(tmp_path / "data.npz", episodes=np.zeros(6, int))
     with pytest.warns(UserWarning, match="ignored arrays episodes"):

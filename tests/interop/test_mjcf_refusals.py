@@ -26,6 +26,25 @@ def octagon(site, limits=(1, 1, 1, 1)):
 
 
 PLANK = f'<body name="plank" pos="1 0 0">{FREE}<geom {BOX}/></body>'
+
+
+def stopped(fields):
+    """A hinge with ends."""
+    return document(joints=HINGE.format(f'limited="true" range="-1 1" {fields}'))
+
+
+def nailed(fields):
+    """A body that an equality holds to the world."""
+    tie = f'<equality><weld body1="thing" {fields}/></equality>'
+    return document(sections=tie)
+
+
+def flagged(text, flag):
+    option = '<option gravity="0 -9.81 0"'
+    return text.replace(f"{option}/>", f'{option}><flag {flag}="enable"/></option>')
+
+
+SOFT = "expected a constraint that is hard, with a time constant of at most 0.04 s"
 REFUSALS = {
     "not a document": (
         "<mujoco><nonsense/></mujoco>",
@@ -81,7 +100,7 @@ REFUSALS = {
     ),
     "two geoms": (
         document(more=f"<geom {QUIET}/>"),
-        "body 'thing': expected one geom for its outline, got 0",
+        "expected one geom for its outline, got 2 of which 0 can touch others",
     ),
     "capsule": (
         document(geom='type="capsule" size="0.1 0.1" contype="0" conaffinity="0"'),
@@ -205,6 +224,102 @@ REFUSALS = {
             sections=brakes(*octagon("s"), *octagon("t")),
         ),
         "body 'thing': expected feet that share the load",
+    ),
+    "heavy tendon": (
+        document(
+            joints=HINGE.format(""),
+            sections='<tendon><fixed name="t" armature="0.2"><joint joint="j" '
+            'coef="1"/></fixed></tendon>',
+        ),
+        "option: expected tendons without armature, got 0.2",
+    ),
+    "heavy drive": (
+        document(
+            joints=HINGE.format(""),
+            sections='<actuator><motor joint="j" armature="0.1"/></actuator>',
+        ),
+        "actuator 'actuator0': expected no armature, got",
+    ),
+    "damped drive": (
+        document(
+            joints=HINGE.format(""),
+            sections='<actuator><motor joint="j" damping="0.1"/></actuator>',
+        ),
+        "actuator 'actuator0': expected no damping, got",
+    ),
+    "drive that cannot rest": (
+        document(
+            joints=HINGE.format(""),
+            sections='<actuator><motor joint="j" ctrlrange="1 2"/></actuator>',
+        ),
+        r"actuator 'actuator0': expected a ctrlrange about 0, got \(1.0, 2.0\)",
+    ),
+    "soft ends": (
+        stopped('solreflimit="0.2 1"'),
+        rf"joint 'j': {SOFT} \(here 0.2 s\), got solreflimit 0.2 1 and solimplimit",
+    ),
+    "soft ends as a spring": (
+        stopped('solreflimit="-25 -10"'),
+        rf"joint 'j': {SOFT} \(here 0.2 s\), got solreflimit -25 -10",
+    ),
+    "slow ends": (stopped('solreflimit="0.02 10"'), SOFT),
+    "ends that begin softly": (
+        stopped('solimplimit="0 0.95 1"'),
+        rf"{SOFT} .* solimplimit 0 0.95 1 0.5 2",
+    ),
+    "ends that throw back": (
+        stopped('solreflimit="0.02 0.3"'),
+        "joint 'j': expected a stop that does not throw back, .*ratio of 0.5, got",
+    ),
+    "ends without damping": (
+        stopped('solreflimit="-1000 0"'),
+        "joint 'j': expected a constraint with stiffness and damping, got",
+    ),
+    "soft friction": (
+        document(joints=HINGE.format('frictionloss="1" solreffriction="0.5 1"')),
+        rf"joint 'j': {SOFT} .*, got solreffriction 0.5 1 and solimpfriction",
+    ),
+    "soft weld": (
+        nailed('solref="0.3 1"'),
+        rf"equality 'equality0': {SOFT} .*, got solref 0.3 1 and solimp 0.9",
+    ),
+    "soft equalities of a class": (
+        nailed("").replace(
+            "<worldbody>",
+            '<default><equality solref="0.3 1"/></default><worldbody>',
+        ),
+        rf"equality 'equality0': {SOFT}",
+    ),
+    "weld that turns": (
+        nailed('torquescale="0"'),
+        "equality 'equality0': expected a torquescale above 0, got 0",
+    ),
+    "soft contact": (
+        document(geom=f'{BOX} solref="0.3 1"', others=PLANK),
+        rf"geom 'skin': {SOFT} .*, got solref 0.3 1 and solimp 0.9",
+    ),
+    "soft contact of a pair": (
+        document(
+            geom=BOX,
+            others=PLANK,
+            sections='<contact><pair geom1="skin" geom2="top" solref="0.3 1"/>'
+            "</contact>",
+        ).replace(f"{FREE}<geom {BOX}", f'{FREE}<geom name="top" {BOX}'),
+        rf"pair 'pair0': {SOFT}",
+    ),
+    "contact from afar": (
+        document(geom=f'{BOX} margin="0.05"', others=PLANK),
+        "geom 'skin': expected a margin of at most 0.001, got 0.05",
+    ),
+    "contact of options": (
+        flagged(document(geom=BOX, others=PLANK), "override"),
+        "option: expected no flag override where bodies touch",
+    ),
+    "asleep": (
+        flagged(document(), "sleep").replace(
+            '<body name="thing"', '<body name="thing" sleep="init"'
+        ),
+        "option: expected no flag sleep where bodies start asleep",
     ),
     "wind": (
         document().replace('gravity="0 -9.81 0"', 'density="1.2"'),

@@ -132,6 +132,12 @@ def test_the_unchanged_scene_is_fine():
         ((*CART, "contact"), {"friction": -1}, r"contact.friction: .* at least 0"),
         ((*CART, "contact"), {"restitution": 2}, r"contact.restitution: .* 0 to 1"),
         ((*CART, "center_of_mass"), [0], r"center_of_mass: expected a list of 2"),
+        (
+            (*CART, "center_of_mass"),
+            [5, 5],
+            r"'cart': center_of_mass: expected a point of the .* got \[5.0, 5.0\]",
+        ),
+        ((*CART, "center_of_mass"), [0, 0.31], r"center_of_mass: .* \[0.0, 0.31\]"),
         ((*CART, "shape"), None, r"'cart': shape: expected an object, got None"),
         ((*CART, "shape", "type"), "blob", r"shape.type: expected box, polygon or cir"),
         ((*CART, "shape", "radius"), 1, r"shape: expected fields .* got 'radius'"),
@@ -186,6 +192,22 @@ def test_a_bad_field_is_refused_by_name(
         scene_spec_from_dict(_changed(path, value), source="room.json")
     assert str(caught.value).startswith("room.json: ")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("center", [[0.5, 0.3], [-0.5, 0.0], [0.1 + 0.2, -0.3]])
+def test_a_centre_of_mass_may_lie_on_the_edge(center: list):
+    spec = scene_spec_from_dict(_changed((*CART, "center_of_mass"), center))
+    assert spec.bodies[0].shift.tolist() == center
+
+
+def test_a_centre_of_mass_is_looked_for_in_the_outline_as_it_is_drawn():
+    triangle = {"type": "polygon", "vertices": [[4, 4], [6, 4], [4, 6]]}
+    scene = _changed((*CART, "shape"), triangle)
+    scene["bodies"][0]["center_of_mass"] = [4.9, 4.9]
+    assert scene_spec_from_dict(scene).bodies[0].shift.tolist() == [4.9, 4.9]
+    scene["bodies"][0]["center_of_mass"] = [5.1, 5.1]
+    with pytest.raises(ValueError, match=r"center_of_mass: expected a point of the"):
+        scene_spec_from_dict(scene)
 
 
 def test_a_circle_off_its_centre_of_mass_is_refused():

@@ -57,6 +57,57 @@ CASES = {
 }
 
 
+RANGE = {"lower": -0.5, "upper": 0.5}
+RANGE_CASES = {
+    "pin above": (
+        pin(**RANGE),
+        (0.0, 0.0, 2.0),
+        ["1.5 rad outside the range of its pin to the world"],
+    ),
+    "pin below": (
+        pin(b="block", anchor_b=[-0.3, 2], lower=-1.0),
+        (0.0, -0.3, 0.0),
+        ["0.571 rad outside the range of its pin to body 'block'"],
+    ),
+    # Whole turns count.
+    "pin a turn ahead": (
+        pin(**RANGE),
+        (0.0, 0.0, 2.0 * math.pi),
+        ["5.78 rad outside the range of its pin to the world"],
+    ),
+    "pin at its end": (pin(**RANGE), (0.0, 0.0, 0.5), []),
+    "rounding of an end": (pin(**RANGE), (0.0, 0.0, 0.5009), []),
+    "one end": (pin(lower=-0.5), (0.0, 0.0, 9.0), []),
+    "guide": (
+        guide(**RANGE),
+        (2.0, 0.0, 0.0),
+        ["1.5 m outside the range of its guide to the world"],
+    ),
+    "guide that turned with its block": (
+        guide(b="block", axis=0.0, upper=3.0),
+        (2.0, 7.0, math.pi / 2),
+        ["4 m outside the range of its guide to body 'block'"],
+    ),
+    "guide within": (guide(b="block", upper=8.0), (2.0, 7.0, math.pi / 2), []),
+    "both": (
+        pin(anchor_b=[5, 0], **RANGE),
+        (0.0, 0.0, -0.6),
+        [
+            "5 m off its pin to the world",
+            "0.1 rad outside the range of its pin to the world",
+        ],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", RANGE_CASES.values(), ids=RANGE_CASES)
+def test_what_is_outside_a_range_is_told(case):
+    joint, pose, expected = case
+    spec = spec_of(joint, pose)
+    said = start_gaps(spec.params(), spec.initial_state(), spec.names)
+    assert said == [f"body 'box' starts {gap}" for gap in expected]
+
+
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_what_is_off_is_told(case):
     joint, pose, expected = case
