@@ -26,6 +26,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from boomdp_jax.core.arrays import FloatScalar
+from boomdp_jax.physics.contact_geometry import Pair
 from boomdp_jax.physics.contact_rows import (
     Ease,
     Impulse,
@@ -41,6 +42,7 @@ PUSH_SPEED = 1.0
 is not left in their twists."""
 
 # Impacts slower than this do not bounce [m/s]; a bouncing ball comes to rest at it.
+# What forces do to a speed within a substep may be more (`_put_off`).
 _REST_SPEED = 0.05
 
 # An overlap is undone like that of a damped spring with a quarter of the substep rate
@@ -103,7 +105,8 @@ def part(
             shift = shift + sign * (rows.normal[0] * x + rows.normal[1] * y + turned)
         slack = pace.rate * (row.separation + shift)
         bias, kept = _softened(slack, pace.smoothing)
-        waits, parts = _put_off(rows, row, meeting[i], speed, slack, pace.rate)
+        speeds = meeting[i], speed
+        waits, parts = _put_off(rows, row, speeds, normal, slack, pace.rate)
         counts = (1.0 - waits) * (1.0 - parts)
         return _Demand(-bias, jnp.where(counts > 0.0, kept, 1.0 - parts), counts)
 
@@ -165,7 +168,8 @@ def settle(
     def demand(i: int, normal, speed) -> _Demand:
         row, met = rows.points[i], meeting[i]
         bounce = jnp.where(met < -_REST_SPEED, -rows.restitution * met, 0.0)
-        waits, _ = _put_off(rows, row, met, speed, jnp.zeros_like(normal), pace.rate)
+        slack = jnp.zeros_like(normal)
+        waits, _ = _put_off(rows, row, (met, speed), normal, slack, pace.rate)
         if pace.smoothing is None:
             touches = (normal > 0.0).astype(normal.dtype)
         else:
@@ -186,21 +190,33 @@ def _approach(rows: Rows, row: Row, twists: tuple[Twist, Twist]) -> FloatScalar:
 
 
 def _put_off(
-    rows: Rows, row: Row, before: FloatScalar, now: FloatScalar, slack, rate
+    rows: Rows, row: Row, speeds: Pair, normal: FloatScalar, slack, rate
 ) -> tuple:
     """Whether a point is left to the next substep, and whether it lets go, as numbers.
+
+    Of the speeds the first is that at the start of the substep.
 
     Bodies that bounce and that meet only through what others do to them within this
     substep have an impact of their own, after the one that caused it: of a row of balls
     the last flies off. Those that part as they bounced before let go, whatever others
     do to them. Neither is so where one would sink into the other by more than a quarter
     of its thickness.
+
+    What forces do within a substep is no impact. A body at rest that they drive on, or
+    that is handed the load of a stack, is held at once, and one that they bring back at
+    once does not let go; else what falls faster in a substep than `_REST_SPEED` lies on
+    a floor bouncing, inside it, for ever. Motors and joints are not among those forces;
+    of theirs only what the contact already carries counts.
     """
+    before, now = speeds
     a, b = (jnp.abs(arm) for arm in row.tangent_arms)
     is_mild = -(now + slack) < 0.5 * rate * jnp.minimum(a, b)
     bounces = (rows.restitution > 0.0) & is_mild
-    parts = before > _REST_SPEED
-    is_hit = now < -(_REST_SPEED + jnp.maximum(slack, 0.0))
+    can_push = row.gains[0] > 0.0
+    carried = normal / jnp.where(can_push, row.gains[0], 1.0)
+    parts = before > _REST_SPEED + rows.forced
+    least = _REST_SPEED + rows.forced + carried + jnp.maximum(slack, 0.0)
+    is_hit = now < -least
     waits = bounces & is_hit & (jnp.abs(before) <= _REST_SPEED)
     dtype = slack.dtype
     return waits.astype(dtype), (bounces & parts).astype(dtype)

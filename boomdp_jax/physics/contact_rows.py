@@ -10,8 +10,10 @@ $r_a, r_b$ of a point,
 - effective mass $K = J A^{-1} J^T$, with $A$ the inertia as the rest of the substep
   leaves it to feel (friction of wheels and floor and pins to the world included).
 
-Contacts are found once a step. Within it a normal stays as it is and points turn with
-their bodies, so that a separation follows from how bodies moved since.
+Contacts are found once a step. Within it a normal stays as it is and corners turn with
+their bodies, so that a separation follows from how bodies moved since. What a radius
+adds to an outline does not turn: whichever point of a disc faces the other body, it is
+as far from the centre. A lever of friction is that of the point that touches now.
 """
 
 from typing import NamedTuple
@@ -58,6 +60,8 @@ class Side(NamedTuple):
     radius: FloatScalar
     friction: FloatScalar
     restitution: FloatScalar
+    forced: Twist
+    """Twist that forces give it in a substep, world frame."""
     ease: Ease
 
 
@@ -80,6 +84,9 @@ class Rows(NamedTuple):
     normal: Pair
     friction: FloatScalar
     restitution: FloatScalar
+    forced: FloatScalar
+    """Most that forces on both do within a substep to the speed at which they meet,
+    were one of them held [m/s]."""
     points: list[Row]
 
 
@@ -121,7 +128,7 @@ def begin(a: Side, b: Side, allowed: FloatScalar, impulses: list[Impulse]) -> St
     )
     nx, ny = found.normal
     restitution = jnp.maximum(a.restitution, b.restitution)
-    points, kept = [], []
+    points, kept, forced = [], [], []
     for point, separation, impulse in zip(
         found.points, found.separation, impulses, strict=True
     ):
@@ -144,6 +151,11 @@ def begin(a: Side, b: Side, allowed: FloatScalar, impulses: list[Impulse]) -> St
                 separation=jnp.where(exists, separation, 0.0),
             )
         )
+        speeds = (
+            jnp.abs(side.forced[0] * nx + side.forced[1] * ny + side.forced[2] * arm)
+            for side, arm in zip((a, b), normal_arms, strict=True)
+        )
+        forced.append(jnp.where(exists, sum(speeds), 0.0))
         is_kept = exists.astype(separation.dtype)
         kept.append((is_kept * impulse[0], is_kept * impulse[1]))
     product = a.friction * b.friction
@@ -153,7 +165,8 @@ def begin(a: Side, b: Side, allowed: FloatScalar, impulses: list[Impulse]) -> St
     )
     # A pair that may not collide is nowhere near.
     least = jnp.where(allowed > 0.0, jnp.minimum(*found.separation), 1e6)
-    return Start(Rows((nx, ny), friction, restitution, points), kept, least)
+    rows = Rows((nx, ny), friction, restitution, jnp.maximum(*forced), points)
+    return Start(rows, kept, least)
 
 
 def gain_of(a: Ease, b: Ease, direction: Pair, arms: Pair, exists) -> FloatScalar:

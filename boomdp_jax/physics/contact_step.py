@@ -81,6 +81,7 @@ class _Pose(NamedTuple):
     y: Any
     corner_x: list
     corner_y: list
+    forced: tuple
 
 
 def over_pairs(function, *arguments, num_passed: int = 0):
@@ -93,13 +94,14 @@ def over_pairs(function, *arguments, num_passed: int = 0):
 
 
 def find_contacts(
-    world: ContactWorld, motion: Motion, impulses: Impulses
+    world: ContactWorld, motion: Motion, forced: tuple, impulses: Impulses
 ) -> tuple[Contacts, Touch]:
     """Find the contacts of a step.
 
     Args:
         world: outlines, filters and surfaces.
         motion: at the start of the step.
+        forced: twist that forces give every body in a substep.
         impulses: at the end of the step before; zeros if that is not known.
 
     Returns:
@@ -114,6 +116,7 @@ def find_contacts(
         y=motion.y,
         corner_x=[cos * x - sin * y for x, y in corners],
         corner_y=[sin * x + cos * y for x, y in corners],
+        forced=forced,
     )
     zero = jnp.zeros_like(motion.x)
     carry = seated(pose, num_bodies), seated((zero, zero, zero), num_bodies)
@@ -141,7 +144,10 @@ def _begin(
     impulses,
     sums: tuple,
 ) -> tuple[Start, tuple]:
-    a, b = (Side(*p, *f, e) for p, f, e in zip(pose, fixed, eases, strict=True))
+    a, b = (
+        Side(*p[:-1], *f, p.forced, e)
+        for p, f, e in zip(pose, fixed, eases, strict=True)
+    )
     start = begin(a, b, allowed, impulses)
     return start, add_pushes(start.rows, start.impulses, sums)
 

@@ -43,6 +43,9 @@ class ContactWorld(NamedTuple):
     """What the contacts of a world need and no step changes."""
 
     outlines: Outlines
+    turns: PerBody
+    """One where there are corners, which turn with the body. Zero for a disc: whichever
+    of its points faces another body, it is as far away as any other was."""
     fixed: Rounds
     """`Fixed` of both bodies of each pair, round by round."""
     allowed: Rounds
@@ -93,6 +96,7 @@ def contact_world(scene: Scene, params: Params, prepared: Prepared) -> ContactWo
     ease = Ease(light, light, prepared.mobile / prepared.inertia)
     return ContactWorld(
         Outlines(x, y),
+        has_corners.astype(scene.radius.dtype),
         fixed,
         _of_pairs(_may_touch(scene, params, prepared)),
         each_round(ease, num_bodies),

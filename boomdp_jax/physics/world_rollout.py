@@ -203,7 +203,6 @@ def _step(
 
         motion, _ = _repeated(alone, motion, num_substeps)
         return motion, None, None, None
-    contacts, touch = find_contacts(contact, motion, impulses)
     light = mobile / prepared.mass
     ease = Ease(light, light, mobile / prepared.inertia)
     gain = (
@@ -211,13 +210,17 @@ def _step(
         light * (length[None] * force[1] + prepared.weight[1]),
         ease.spin * length[None] * force[2],
     )
+    # Only whether something is an impact depends on it.
+    forced = jax.lax.stop_gradient(gain)
+    contacts, touch = find_contacts(contact, motion, forced, impulses)
     start = motion
 
     def advance(carry, _):
         motion, touch = carry
         motion = motion._replace(x=unmerged(motion.x))
         free = tuple(v + dv for v, dv in zip(motion[3:], gain, strict=True))
-        moved = tuple(p - q for p, q in zip(motion[:3], start[:3], strict=True))
+        x, y, angle = (p - q for p, q in zip(motion[:3], start[:3], strict=True))
+        moved = x, y, contact.turns * angle
         if is_coupled(prepared):
             carry = coupled_substep(
                 contacts, prepared, motion, moved, force, touch, num_sweeps
