@@ -6,6 +6,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from boomdp_jax.core.history import History
+from boomdp_jax.inference.doubts.told_by_channels import (
+    about_pin,
+    along_line,
+    between,
+    spin_about_pin,
+)
 from boomdp_jax.inference.posteriors.posterior import Posterior
 from boomdp_jax.inference.readings.reading_sequence import readings_in_order, scatter
 from boomdp_jax.physics.params import WORLD
@@ -21,6 +27,8 @@ _FEWEST = 20
 _ODD = 4.0
 # Probability of a pin from which the body is taken to turn about it.
 _LIKELY = 0.5
+# Places that are told hardly worse than usual.
+_WHOLE = 1.5
 
 
 class Way(NamedTuple):
@@ -28,8 +36,12 @@ class Way(NamedTuple):
 
     place: Float[np.ndarray, " reading"]
     speed: Float[np.ndarray, " reading"]
-    """NaN where it was not read."""
+    """NaN where no channel tells it."""
+    place_error: Float[np.ndarray, " reading"]
+    speed_error: Float[np.ndarray, " reading"]
+    """More than the usual where only some of the channels were read."""
     noise: float
+    """Usual error of places."""
     run: Int[np.ndarray, " reading"]
     time: Float[np.ndarray, " reading"]
     force: Float[np.ndarray, "reading push"]
@@ -57,18 +69,33 @@ def find_ways(
     gravity = np.asarray(spec.scene.gravity, float)
     steady = np.ones((len(values), 1))
     ways = []
-    line = _line(values, run)
+    arm = _pin_arm(posterior, body)
+    turning = scatter(values[:, 2:3], run, is_angle=True, time=time)
+    line = _line(values, run, time)
+    # Over a short way an arc looks like a line, along which pushes do not do the same.
+    if line is not None and arm is not None and turning:
+        line = None if turning * np.hypot(*arm) < _ACROSS * line[2] else line
     if line is not None:
         centre, along, noise = line
-        place = (values[:, :2] - centre) @ along
-        # What is pinned far away goes along a line as well, by torques too.
-        force = [wrench[:, body, :2] @ along, steady, wrench[:, body, 2]]
+        place, place_error = along_line(values[:, :2], centre, along, noise)
+        pace = _of_speeds(values[:, 3:5], run, time)
+        speed, speed_error = along_line(values[:, 3:5], np.zeros(2), along, pace)
+        # What is pinned far away goes along a line as well, by torques too, which do
+        # as much as it turns on the way.
+        torque = wrench[:, body, 2]
+        turn = _turn_on_way(_unwrapped(values[:, 2], run), place, run)
+        if turn is None:
+            force = [wrench[:, body, :2] @ along, steady, torque]
+        else:
+            force = [wrench[:, body, :2] @ along + turn * torque, steady]
         for other in others:
             force += [wrench[:, other, :2] @ along, wrench[:, other, 2]]
         ways.append(
             Way(
-                _without_odd(place, time, run, noise),
-                values[:, 3:5] @ along,
+                _without_odd(place, time, run, place_error),
+                speed,
+                place_error,
+                speed_error,
                 noise,
                 run,
                 time,
@@ -76,18 +103,23 @@ def find_ways(
                 "the line that it goes along",
             )
         )
-    arm = _pin_arm(posterior, body)
-    noise = scatter(values[:, 2:3], run, is_angle=True)
-    if arm is not None and noise is not None:
+    if arm is not None and turning:
+        noise = turning
         angle = _unwrapped(values[:, 2], run)
-        cos, sin = np.cos(angle), np.sin(angle)
+        # A push turns it whether or not its angle was read there.
+        nearly = between(angle, run, time)
+        cos, sin = np.cos(nearly), np.sin(nearly)
         lever = np.column_stack(
             [cos * arm[0] - sin * arm[1], sin * arm[0] + cos * arm[1]]
         )
         pins = values[:, :2] - lever
+        pins[np.isnan(angle)] = np.nan
         is_read = np.all(np.isfinite(pins), axis=1)
         pin = pins[is_read].mean(axis=0) if is_read.any() else np.full(2, np.nan)
         lever = np.nan_to_num(lever)
+        (turned, turned_error), arms = about_pin(angle, values[:, :2], run, time, noise)
+        pace = _of_speeds(values[:, 5:], run, time)
+        spin, spin_error = spin_about_pin(values[:, 5], values[:, 3:5], arms, pace)
         force = [_torque(wrench[:, body], lever), steady]
         if np.any(gravity != 0.0):
             force += [lever]
@@ -95,8 +127,10 @@ def find_ways(
             force += [_torque(wrench[:, other], poses[:, other, :2] - pin)]
         ways.append(
             Way(
-                _without_odd(angle, time, run, noise),
-                values[:, 5],
+                _without_odd(turned, time, run, turned_error),
+                spin,
+                turned_error,
+                spin_error,
                 noise,
                 run,
                 time,
@@ -107,12 +141,34 @@ def find_ways(
     return ways
 
 
-def _line(values: np.ndarray, run: np.ndarray) -> tuple | None:
+def whole_places(way: Way) -> Float[np.ndarray, " reading"]:
+    """Places told as well as they usually are, by which ends are told; else NaN."""
+    return np.where(way.place_error < _WHOLE * way.noise, way.place, np.nan)
+
+
+def _turn_on_way(angle: np.ndarray, place: np.ndarray, run: np.ndarray) -> float | None:
+    """By how much it turns per length of a line; None where that was not read."""
+    is_read = np.isfinite(angle) & np.isfinite(place)
+    if is_read.sum() < _FEWEST:
+        return None
+    # Runs may differ by whole turns.
+    apart = (run[is_read, None] == np.unique(run)).astype(float)
+    reasons = np.column_stack([place[is_read], apart])
+    return float(np.linalg.lstsq(reasons, angle[is_read], rcond=1e-9)[0][0])
+
+
+def _of_speeds(values: np.ndarray, run: np.ndarray, time: np.ndarray) -> float:
+    """Noise of speeds; without bound where too few, or none that differ, were read."""
+    return scatter(values, run, time=time) or np.inf
+
+
+def _line(values: np.ndarray, run: np.ndarray, time: np.ndarray) -> tuple | None:
     """Middle and direction of the line that positions lie on, and their noise."""
     place = values[:, :2]
-    noise = scatter(place, run)
+    noise = scatter(place, run, time=time)
     is_read = np.all(np.isfinite(place), axis=1)
-    if noise is None or is_read.sum() < _FEWEST:
+    # Readings that never differ are of what went no way at all.
+    if not noise or is_read.sum() < _FEWEST:
         return None
     centre = place[is_read].mean(axis=0)
     _, size, directions = np.linalg.svd(place[is_read] - centre, full_matrices=False)
@@ -170,12 +226,12 @@ def _acting(force: list[np.ndarray]) -> np.ndarray:
 
 
 def _without_odd(
-    place: np.ndarray, time: np.ndarray, run: np.ndarray, noise: float
+    place: np.ndarray, time: np.ndarray, run: np.ndarray, error: np.ndarray
 ) -> np.ndarray:
     """The same with NaN for a reading that is off while its neighbours are not.
 
     What bounces is off the line of its neighbours too, but they are then off the lines
-    of those beside them.
+    of those beside them; where it does so at the last reading of a run little is lost.
     """
     known = np.flatnonzero(np.isfinite(place))
     q, t, of = place[known], time[known], run[known]
@@ -196,7 +252,17 @@ def _without_odd(
     beside[1, :-1] = off(-2, 1)[1:]
     most = np.max(np.where(np.isnan(beside), 0.0, beside), axis=0)
     is_told = np.any(np.isfinite(beside), axis=0)
-    is_odd = is_told & (own > _ODD * np.maximum(most, noise))
+    is_odd = is_told & (own > _ODD * np.maximum(most, error[known]))
+    # What begins or ends a run has neighbours on one side.
+    new = of[1:] != of[:-1]
+    for edge, near, far in (
+        (np.flatnonzero(np.append(new, True)), -1, -2),
+        (np.flatnonzero(np.append(True, new)), 1, 2),
+    ):
+        last = edge[(edge + far >= 0) & (edge + far < len(q))]
+        bend, before = own[last + near], np.nan_to_num(own[last + far])
+        is_far = bend > _ODD * np.maximum(before, error[known][last])
+        is_odd[last[is_far & ~is_odd[last + near]]] = True
     out = place.copy()
     out[known[is_odd]] = np.nan
     return out

@@ -55,6 +55,7 @@ def scatter(
     run: Int[np.ndarray, " reading"],
     *,
     is_angle: bool = False,
+    time: Float[np.ndarray, " reading"] | None = None,
 ) -> float | None:
     """Standard deviation of the noise of readings, at most.
 
@@ -66,6 +67,8 @@ def scatter(
         values: readings; what is not finite is skipped.
         run: which run each belongs to.
         is_angle: whether whole turns do not count.
+        time: of each reading, where those that were not read leave gaps; without it
+            readings are taken to be evenly spaced.
 
     Returns:
         In the unit of the values, the root mean square of the parts'; None where one
@@ -78,7 +81,14 @@ def scatter(
         change = np.diff(own)
         if is_angle:
             change = np.angle(np.exp(1j * change))
-        bend = np.abs(np.diff(change)[of[2:] == of[:-2]])
+        bend = np.diff(change)
+        if time is not None:
+            at = time[is_read]
+            share = (at[1:-1] - at[:-2]) / (at[2:] - at[:-2])
+            # Off the line through the others, in units of what noise makes of that.
+            bend = (1.0 - share) * change[:-1] - share * change[1:]
+            bend *= np.sqrt(6.0 / (1.0 + share**2 + (1.0 - share) ** 2))
+        bend = np.abs(bend[of[2:] == of[:-2]])
         if len(bend) < _FEWEST:
             return None
         sd = float(np.median(bend)) / (_MEDIAN * np.sqrt(6.0))
