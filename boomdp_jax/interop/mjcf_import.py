@@ -14,7 +14,7 @@ from boomdp_jax.interop.mjcf_softness import check_hard
 from boomdp_jax.interop.mjcf_ties import read_equalities, read_floor
 from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
 
-_MOST_MARGIN = 1e-3
+_MOST_MARGIN = 1e-2
 """By how much surfaces may stand out from their outlines [m]."""
 
 
@@ -36,8 +36,8 @@ def from_mjcf(
 
     Ends of ranges, equalities, contact and dry friction of joints are taken as hard.
     MuJoCo's own give way a little, and are refused where their `solref` and `solimp`
-    make them much softer than its default (a time constant above 0.04 s instead of
-    0.02 s), or let ends throw back.
+    make them much softer than its default (a time constant above 0.1 s instead of
+    0.02 s), or let ends throw back. Margins up to 1 cm are taken as none.
 
     Args:
         source: a path, or the document itself, which begins with "<".

@@ -13,10 +13,11 @@ from jaxtyping import Float
 
 from boomdp_jax.interop.mjcf_document import Document
 
-_LONGEST = 0.04
-"""Time constant up to which a constraint counts as hard [s]: twice MuJoCo's own."""
+_LONGEST = 0.1
+"""Time constant up to which a constraint counts as hard [s]: five times MuJoCo's own.
+Ends of 0.08 s are usual, and mostly not reached."""
 
-_LEAST_RATIO = 0.5
+_LEAST_RATIO = 0.3
 """Damping ratio from which an end counts as one that does not throw back."""
 
 _DEPTH = 0.01

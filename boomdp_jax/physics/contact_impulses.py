@@ -106,7 +106,7 @@ def part(
         slack = pace.rate * (row.separation + shift)
         bias, kept = _softened(slack, pace.smoothing)
         speeds = meeting[i], speed
-        waits, parts = _put_off(rows, row, speeds, normal, slack, pace.rate)
+        waits, parts = _put_off(rows, row, speeds, slack, pace.rate)
         counts = (1.0 - waits) * (1.0 - parts)
         return _Demand(-bias, jnp.where(counts > 0.0, kept, 1.0 - parts), counts)
 
@@ -169,7 +169,7 @@ def settle(
         row, met = rows.points[i], meeting[i]
         bounce = jnp.where(met < -_REST_SPEED, -rows.restitution * met, 0.0)
         slack = jnp.zeros_like(normal)
-        waits, _ = _put_off(rows, row, (met, speed), normal, slack, pace.rate)
+        waits, _ = _put_off(rows, row, (met, speed), slack, pace.rate)
         if pace.smoothing is None:
             touches = (normal > 0.0).astype(normal.dtype)
         else:
@@ -189,9 +189,7 @@ def _approach(rows: Rows, row: Row, twists: tuple[Twist, Twist]) -> FloatScalar:
     return along + row.normal_arms[1] * b_spin - row.normal_arms[0] * a_spin
 
 
-def _put_off(
-    rows: Rows, row: Row, speeds: Pair, normal: FloatScalar, slack, rate
-) -> tuple:
+def _put_off(rows: Rows, row: Row, speeds: Pair, slack, rate) -> tuple:
     """Whether a point is left to the next substep, and whether it lets go, as numbers.
 
     Of the speeds the first is that at the start of the substep.
@@ -202,21 +200,17 @@ def _put_off(
     do to them. Neither is so where one would sink into the other by more than a quarter
     of its thickness.
 
-    What forces do within a substep is no impact. A body at rest that they drive on, or
-    that is handed the load of a stack, is held at once, and one that they bring back at
-    once does not let go; else what falls faster in a substep than `_REST_SPEED` lies on
-    a floor bouncing, inside it, for ever. Motors and joints are not among those forces;
-    of theirs only what the contact already carries counts.
+    What forces do within a substep is no impact. A body at rest that they drive on is
+    held at once, and one that they bring back at once does not let go; else what falls
+    faster in a substep than `_REST_SPEED` lies on a floor bouncing, inside it, for
+    ever. Motors and joints are not among those forces.
     """
     before, now = speeds
     a, b = (jnp.abs(arm) for arm in row.tangent_arms)
     is_mild = -(now + slack) < 0.5 * rate * jnp.minimum(a, b)
     bounces = (rows.restitution > 0.0) & is_mild
-    can_push = row.gains[0] > 0.0
-    carried = normal / jnp.where(can_push, row.gains[0], 1.0)
     parts = before > _REST_SPEED + rows.forced
-    least = _REST_SPEED + rows.forced + carried + jnp.maximum(slack, 0.0)
-    is_hit = now < -least
+    is_hit = now < -(_REST_SPEED + rows.forced + jnp.maximum(slack, 0.0))
     waits = bounces & is_hit & (jnp.abs(before) <= _REST_SPEED)
     dtype = slack.dtype
     return waits.astype(dtype), (bounces & parts).astype(dtype)

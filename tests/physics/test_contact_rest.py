@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.physics.contact_scenes import FLOOR, body, run, spec_of
+from tests.physics.contact_scenes import FLOOR, body, fixed, run, spec_of
 
 G, RADIUS = 9.81, 0.1
 SUBSTEPS = 4
@@ -129,3 +129,37 @@ def test_tower_of_bouncing_boxes_stands(restitution):
     assert np.max(np.abs(last.twist)) < 1e-3
     standing = 0.1 + 0.2 * np.arange(5)
     np.testing.assert_allclose(states.pose[-1, 1:, 1], standing, rtol=0, atol=5e-3)
+
+
+@pytest.mark.parametrize("density", [80.0, 200.0])
+def test_what_hits_a_box_on_a_floor_bounces_as_off_a_free_one(density):
+    """The floor answers the blow after it: from eight heights, by the closed form."""
+    restitution, heights = 0.6, np.linspace(0.3, 0.5, 8)
+    floor = fixed("floor", (60.0, 0.5), (0.0, -0.5, 0.0), friction=0.5)
+    bodies = [floor]
+    for number, height in enumerate(heights):
+        x = 4.0 * number - 14.0
+        lower = body(
+            f"box{number}",
+            (0.3, 0.1),
+            (x, 0.1, 0.0),
+            restitution=restitution,
+            density=density,
+        )
+        start = (x, 0.3 + height, 0.0)
+        bodies += [lower, body(f"disc{number}", RADIUS, start, restitution=restitution)]
+    spec = spec_of(*bodies, dt=1 / 60)
+    states, _, _ = run(spec, 36)
+    mass = np.array([one.area for one in spec.bodies]) * np.asarray(
+        spec.params().density
+    )
+    light, heavy = mass[2], mass[1]
+    share = (restitution * heavy - light) / (light + heavy)
+    found = []
+    for number, height in enumerate(heights):
+        place = states.pose[:, 2 + 2 * number, 1]
+        rises = states.twist[:, 2 + 2 * number, 1] > 0.02
+        apex = np.max(place[np.argmax(rises) :]) - 0.3
+        found.append(apex / (share**2 * height))
+    assert np.mean(found) == pytest.approx(1.0, abs=0.05)
+    assert np.all(np.abs(np.array(found) - 1.0) < 0.12)

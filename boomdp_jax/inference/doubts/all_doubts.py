@@ -53,7 +53,7 @@ def with_doubts(
         *known_joint_reasons(spec, history),
         *end_stop_reasons(spec, history, posterior),
         *noise_reasons(spec, history, *noise),
-        *density_reasons(spec, history, posterior),
+        *density_reasons(spec, posterior),
         *lever_reasons(spec, posterior),
         *angle_reasons(spec, history, posterior),
         *stance_reasons(spec, posterior),

@@ -102,7 +102,7 @@ def find_modes(
     for number in range(_MOST_ROUNDS):
         report(f"fitting noise and filters, round {number + 1}")
         top = best_of_each(fits, num_structures, 1)
-        found = _noise_of_structures(targets, top, noise, number > 0)
+        found = _noise_of_structures(targets, top, noise, number > 0, is_open)
         if number >= _FEWEST_ROUNDS:
             is_open &= found.gain > _SETTLED
             if not is_open.any():
@@ -245,7 +245,11 @@ class _NoiseFound(NamedTuple):
 
 
 def _noise_of_structures(
-    targets: StructureTarget, top: Fits, start: NoiseFit, has_filters: bool
+    targets: StructureTarget,
+    top: Fits,
+    start: NoiseFit,
+    has_filters: bool,
+    is_open: np.ndarray,
 ) -> _NoiseFound:
     """Noise of the most probable structures; the others get that of the best.
 
@@ -257,6 +261,7 @@ def _noise_of_structures(
         top: one fit of every structure of every object, in order.
         start: where to start for each of them.
         has_filters: whether the fits are of filters, or of single steps.
+        is_open: of which objects; the others keep theirs.
     """
     evidence = _laplace_evidence(targets, top)
     num_objects, num_structures = evidence.shape
@@ -266,6 +271,7 @@ def _noise_of_structures(
     gap = evidence.max(axis=1, keepdims=True) - np.take_along_axis(evidence, order, 1)
     is_asked = (gap < _HOPELESS) | (not has_filters)
     is_asked[:, 0] = True
+    is_asked &= is_open[:, None]
     chosen = np.arange(num_objects)[:, None] * num_structures + order
     rows = chosen[is_asked]
     fitted = top.take(rows)

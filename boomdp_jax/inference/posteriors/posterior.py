@@ -287,7 +287,7 @@ class Posterior(eqx.Module):
         horizons: int | Iterable[int] = (1, 10, 50),
         **options: Any,
     ) -> dict:
-        """Score predictions of held-out motion; see `inference.predict.predict`."""
+        """Score predictions of held-out motion; see `inference.predict`."""
         from boomdp_jax.inference.posteriors.predict import predict
 
         return predict(self, history, horizons, **options)

