@@ -17,7 +17,7 @@ from jaxtyping import Float
 # Rows that it takes to say so.
 _FEWEST = 20
 # Share of rows that speak for it most and are left out: gross errors are few.
-_LEFT_OUT = 0.05
+_LEFT_OUT = 0.02
 # Ratios of both variances that are tried, where rows are of median speed.
 _RATIOS = np.geomspace(1e-3, 1e5, 49)
 # Evidence and share of a step from which on it is a doubt. What rubs and chatters on a

