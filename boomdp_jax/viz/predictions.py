@@ -9,6 +9,7 @@ import numpy as np
 from boomdp_jax.core.arrays import Key
 from boomdp_jax.core.history import History
 from boomdp_jax.core.quick_compile import KeptJit
+from boomdp_jax.inference.hypotheses.whole_motion import whole_scene
 from boomdp_jax.inference.posteriors.posterior import Posterior
 from boomdp_jax.inference.posteriors.predict import commands_in_effect, sample_readings
 from boomdp_jax.inference.posteriors.prediction_starts import PredictionStarts
@@ -57,7 +58,7 @@ def draw_prediction(
         ValueError: no row has a complete reading to start from, or two of each pose
             before it, too few rows follow the start, or there is no such quantity.
     """
-    spec, scene = posterior.spec, posterior.spec.scene
+    spec = posterior.spec
     is_static = np.array([entry.is_static for entry in spec.bodies])
     key = jax.random.key(0) if key is None else key
     kept = posterior.thin(num_draws)
@@ -82,7 +83,7 @@ def draw_prediction(
     action = history.action[None] if commands is None else commands
     draws = _sample(
         key,
-        scene,
+        whole_scene(spec),
         spec.with_surface(kept.params),
         kept.noise_scale,
         jnp.broadcast_to(begin, (count, *begin.shape[1:])),

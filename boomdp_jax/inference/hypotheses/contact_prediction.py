@@ -142,6 +142,8 @@ def contact_step(
         return step(here, params, now, wrench, dt=own)[0], None
 
     # As a loop: a step takes long to compile.
+    # Of walls among the state's bodies a filter may try twists, too.
+    shift = jnp.where(scene.is_static[:, None], 0.0, shift)
     now = State(pose + shift * twist, twist)
     inputs = (shares, masks, jnp.array([False, False, True]))
     now, _ = jax.lax.scan(part, now, inputs)

@@ -16,6 +16,20 @@ finer than that (a foot that sticks or slips). Of a twist that is known less wel
 that, as where a track begins and nobody reads velocities, they are as large as what is
 not known: friction that stops whatever is slower than a reading's noise would else pass
 for one that stops all, and take away in one step what nobody knows.
+
+Where bodies collide whose twists are hardly known, as soon after a track begins, what
+becomes of them bends too much for a derivative: of discs of which two or three readings
+came before the impact, 90 % intervals then hold 0.65 to 0.85 of the truth ever after.
+Predictions start from filters that take such rows by second differences along the axes
+$s_k$ of $P + G Q G^T = \sum_k s_k s_k^T$, with $h^2 = 3$,
+
+$$r_k = \frac{f(m + h s_k) - f(m - h s_k)}{2 h}, \quad
+  b_k = \frac{f(m + h s_k) + f(m - h s_k) - 2 f(m)}{2 h^2},$$
+$$m^- = f(m) + \sum_k b_k, \quad
+  P^- = \sum_k \left(r_k r_k^T + (h^2 - 1)\, b_k b_k^T\right)$$
+
+(Nørgaard, Poulsen and Ravn (2000), New developments in state estimation for nonlinear
+systems, section 4), twice the steps that derivatives take.
 """
 
 import math
@@ -35,6 +49,8 @@ from boomdp_jax.inference.likelihoods.tracking import (
     Gains,
     channel_difference,
     cloud_predictor,
+    near_cloud_predictor,
+    where_near,
 )
 from boomdp_jax.inference.readings.track_data import TrackData, TrackRow, with_delay
 from boomdp_jax.inference.readings.used_rows import scan_used
@@ -45,6 +61,8 @@ from boomdp_jax.physics.scene import Scene
 # twist [m/s, m/s, rad/s].
 _UNKNOWN_START = (1.0, 1.0, 3.0, 1.0, 1.0, 3.0)
 _GROUP = (0, 0, 1, 2, 2, 3)
+# h of second differences: right to fourth order of a normal.
+_REACH = math.sqrt(3.0)
 
 
 class NoiseLevel(eqx.Module):
@@ -72,7 +90,8 @@ class FilteredRow(NamedTuple):
     start: Float[Array, "body 6"]
     """Mean before the first reading of the row."""
     slope: Float[Array, "channel channel"]
-    """Derivative of the row's step by the state before it."""
+    """Derivative of the row's step by the state before it; zero in rows that were
+    taken by second differences."""
 
 
 class Filtered(NamedTuple):
@@ -119,6 +138,23 @@ def neighbour_scales(scale, variance):
     return jnp.where(is_twist, neighbour_scale(scale, variance), scale)
 
 
+def principal_axes(
+    covariance: Float[Array, "channel channel"],
+) -> Float[Array, "channel axis"]:
+    """Axes of one sd each, of what may know some directions for certain.
+
+    Args:
+        covariance: of channels of unlike units.
+
+    Returns:
+        S with $S S^T$ the covariance; zero along directions that are certain.
+    """
+    variance = jnp.diagonal(covariance)
+    sd = jnp.sqrt(jnp.maximum(variance, jnp.finfo(covariance.dtype).tiny))
+    value, vector = jnp.linalg.eigh(covariance / (sd[:, None] * sd[None]))
+    return sd[:, None] * vector * jnp.sqrt(jnp.maximum(value, 0.0))[None]
+
+
 def start_scale(num_bodies: int):
     """Sd of every channel of a start that was not read, body by body."""
     return jnp.tile(jnp.asarray(_UNKNOWN_START), num_bodies)
@@ -139,6 +175,8 @@ class RowFilter:
         dt: Float[Array, " time"] | Float[Array, ""],
         noise: NoiseLevel,
         freedom: float | None = None,
+        *,
+        bends: bool = False,
     ):
         """Work out what does not change from row to row.
 
@@ -148,10 +186,15 @@ class RowFilter:
             dt: as `TrackData.steps` has it.
             noise: of readings and motion.
             freedom: as `TrackData` has it.
+            bends: whether rows in which bodies may touch go by second differences.
         """
         self._freedom = freedom
         num_bodies = noise.reading.shape[0]
         self._num = 6 * num_bodies
+        self._near = None
+        if bends and isinstance(scene, ContactScene):
+            self._near = near_cloud_predictor(scene, params, dt)
+            scene = scene.apart
         self._predict = cloud_predictor(scene, params, dt)
         self._scale = channel_scale(noise.reading).reshape(-1)
         self._variance = jnp.diag(self._scale**2)
@@ -170,9 +213,26 @@ class RowFilter:
     @full_precision
     def __call__(self, before: Estimate, row: TrackRow) -> tuple[Estimate, FilteredRow]:
         """Filter one row."""
-        num = self._num
         start, first = self._begun(before, row)
-        (state, covariance), first_gain, first_whitening, first_density = first
+        begun, first_gain, first_whitening, first_density = first
+        if self._near is None:
+            moved, slope = self._linear(begun, row)
+        else:
+            moved, slope = where_near(
+                row.may_touch,
+                lambda: self._second_order(begun, row),
+                lambda: self._linear(begun, row),
+            )
+        estimate, last_gain, last_whitening, last_density = self._update(
+            moved, row.last, row.last_mask
+        )
+        gains = Gains(first_gain, last_gain, first_whitening, last_whitening)
+        density = first_density + last_density
+        return estimate, FilteredRow(gains, density, start, slope)
+
+    def _linear(self, before: Estimate, row: TrackRow):
+        """Estimate after the row's step, and the derivative that it went by."""
+        num, (state, covariance) = self._num, before
         offset = neighbour_scales(self._scale, jnp.diagonal(covariance))
         offsets = jnp.diag(offset).reshape(num, *state.shape)
         points = jnp.concatenate([state[None], state[None] + offsets])
@@ -181,12 +241,25 @@ class RowFilter:
         spread = covariance + jnp.diag(self._kick**2)
         covariance = slope @ spread @ slope.T
         covariance = 0.5 * (covariance + covariance.T)
-        estimate, last_gain, last_whitening, last_density = self._update(
-            Estimate(images[0], covariance), row.last, row.last_mask
+        return Estimate(images[0], covariance), slope
+
+    def _second_order(self, before: Estimate, row: TrackRow):
+        """The same by second differences along the axes of what is not known."""
+        assert self._near is not None
+        num, (state, covariance) = self._num, before
+        axis = principal_axes(covariance + jnp.diag(self._kick**2))
+        offsets = _REACH * axis.T.reshape(num, *state.shape)
+        points = state[None] + jnp.concatenate(
+            [jnp.zeros_like(offsets[:1]), offsets, -offsets]
         )
-        gains = Gains(first_gain, last_gain, first_whitening, last_whitening)
-        density = first_density + last_density
-        return estimate, FilteredRow(gains, density, start, slope)
+        images = self._near(points, row.action, row.dt, None).reshape(-1, num)
+        ahead, behind = images[1 : num + 1], images[num + 1 :]
+        rise = (ahead - behind) / (2.0 * _REACH)
+        bend = (ahead + behind - 2.0 * images[:1]) / (2.0 * _REACH**2)
+        covariance = rise.T @ rise + (_REACH**2 - 1.0) * bend.T @ bend
+        mean = images[0] + jnp.sum(bend, axis=0)
+        estimate = Estimate(mean.reshape(state.shape), covariance)
+        return estimate, jnp.zeros_like(covariance)
 
     def _begun(self, before: Estimate, row: TrackRow):
         """Mean before the first reading, and what that reading makes of it."""

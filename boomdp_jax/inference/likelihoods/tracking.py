@@ -15,6 +15,7 @@ that it ends at, this is the one-step likelihood of "What Does Physics Bias".
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -167,10 +168,8 @@ def predictor(
 
 
 def where_near(
-    may_touch: BoolScalar | None,
-    near: Callable[[], Array],
-    apart: Callable[[], Array],
-) -> Array:
+    may_touch: BoolScalar | None, near: Callable[[], Any], apart: Callable[[], Any]
+) -> Any:
     """What holds where bodies may touch, or what costs less where they cannot.
 
     Args:
@@ -242,18 +241,27 @@ def cloud_predictor(
             lambda state: predict(state, action, length, None)
         )(points)
 
-    def near(points, action, length):
+    near = near_cloud_predictor(scene, params, dt)
+    apart = cloud_predictor(scene.apart, params, dt)
+    return lambda points, action, length, may_touch: where_near(
+        may_touch,
+        *(lambda to=to: to(points, action, length, None) for to in (near, apart)),
+    )
+
+
+def near_cloud_predictor(
+    scene: ContactScene, params: Params, dt: Float[Array, " time"] | Float[Array, ""]
+) -> Cloud:
+    """The same with contact in all rows."""
+
+    def near(points, action, length, may_touch):
+        length = dt if length is None else length
         impact = first_impact(scene, params, points[0], action, length)
         return jax.vmap(
             lambda state: contact_step(scene, params, state, action, length, impact)
         )(points)
 
-    apart = cloud_predictor(scene.apart, params, dt)
-    return lambda points, action, length, may_touch: where_near(
-        may_touch,
-        lambda: near(points, action, dt if length is None else length),
-        lambda: apart(points, action, length, None),
-    )
+    return near
 
 
 def innovations(

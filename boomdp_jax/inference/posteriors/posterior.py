@@ -17,6 +17,7 @@ from boomdp_jax.core.checked_input import whole_number
 from boomdp_jax.core.history import History
 from boomdp_jax.core.versions import library_versions
 from boomdp_jax.inference.hypotheses.body_numbers import inferred_numbers
+from boomdp_jax.inference.hypotheses.whole_motion import next_state, whole_scene
 from boomdp_jax.inference.posteriors.contact_numbers import report_collisions
 from boomdp_jax.inference.posteriors.file import (
     read_posterior_file,
@@ -37,7 +38,6 @@ from boomdp_jax.inference.posteriors.report import (
 )
 from boomdp_jax.inference.posteriors.summary import plain
 from boomdp_jax.inference.posteriors.table import format_report
-from boomdp_jax.physics import step
 from boomdp_jax.physics.arguments import checked_state, checked_wrench
 from boomdp_jax.physics.params import Params
 from boomdp_jax.physics.scene_spec import SceneSpec, scene_spec_from_dict
@@ -274,12 +274,12 @@ class Posterior(eqx.Module):
             (self.params, self.noise_scale, self.impulse_scale),
         )
         with jax.ensure_compile_time_eval():
-            scene = self.spec.scene
-        params = self.spec.with_surface(params)
-        state = add_impulse(kick_key, state, impulse_scale, scene.is_static)
-        next_state, _ = step(scene, params, state, wrench)
-        law = (noise_scale, scene.is_static, self.degrees_of_freedom)
-        return add_reading_noise(noise_key, next_state, *law)
+            world = whole_scene(self.spec)
+        params, is_static = self.spec.with_surface(params), world.scene.is_static
+        state = add_impulse(kick_key, state, impulse_scale, is_static)
+        after = next_state(world, params, state, wrench)
+        law = (noise_scale, is_static, self.degrees_of_freedom)
+        return add_reading_noise(noise_key, after, *law)
 
     def predict(
         self,

@@ -21,11 +21,16 @@ from boomdp_jax.core.arrays import Key
 from boomdp_jax.core.checked_input import whole_number
 from boomdp_jax.core.history import History
 from boomdp_jax.core.quick_compile import KeptJit
+from boomdp_jax.inference.hypotheses.whole_motion import (
+    WholeScene,
+    many_rollouts,
+    whole_scene,
+)
 from boomdp_jax.inference.posteriors.posterior import Posterior
 from boomdp_jax.inference.posteriors.prediction_starts import PredictionStarts
 from boomdp_jax.inference.posteriors.random_motion import add_impulse, add_reading_noise
 from boomdp_jax.inference.posteriors.summary import CHANNELS, plain
-from boomdp_jax.physics import Params, Scene, rollout, state_from_array, step
+from boomdp_jax.physics import Params, State, rollout, state_from_array, step
 from boomdp_jax.physics.actuator import delayed, past_commands
 
 SCHEMA = "boomdp-predict-1"
@@ -90,13 +95,12 @@ def predict(
         raise ValueError("history: expected at least one row, got none")
     key = jax.random.key(0) if key is None else key
     kept = _enough_draws(posterior, num_draws)
-    scene = posterior.spec.scene
     table = jax.tree.map(np.asarray, history)
-    is_static = np.asarray(scene.is_static)
+    is_static = np.asarray(posterior.spec.scene.is_static)
     known = PredictionStarts(starts, key, kept, history)
     moments = _predict_rows(
         key,
-        scene,
+        whole_scene(posterior.spec),
         posterior.spec.with_surface(kept.params),
         kept.noise_scale,
         kept.impulse_scale,
@@ -149,7 +153,7 @@ def _sorted_horizons(horizons: Any) -> list[int]:
 
 def sample_readings(
     key: Key,
-    scene: Scene,
+    world: WholeScene,
     params: Params,
     noise_scale: Float[Array, "draw body 4"],
     reading: Float[Array, "draw body 6"],
@@ -164,7 +168,7 @@ def sample_readings(
 
     Args:
         key: random key.
-        scene: outlines, feet, gravity.
+        world: of `whole_scene`.
         params: hypotheses with a leading draw axis.
         noise_scale: of each hypothesis [m, rad, m/s, rad/s].
         reading: what is read at the start; the truth scatters around it.
@@ -179,26 +183,40 @@ def sample_readings(
         Readings at those places.
     """
     start_key, end_key, kick_key = jax.random.split(key, 3)
+    is_static = world.scene.is_static
     start = state_from_array(reading)
     if not is_true:
-        start = add_reading_noise(
-            start_key, start, noise_scale, scene.is_static, freedom
+        start = add_reading_noise(start_key, start, noise_scale, is_static, freedom)
+    states = _true_states(kick_key, world, params, start, wrenches, dt, impulse_scale)
+    states = jax.tree.map(lambda leaf: leaf[:, places], states)
+    return add_reading_noise(
+        end_key, states, noise_scale[:, None], is_static, freedom
+    ).array
+
+
+def _true_states(key, world, params, start, wrenches, dt, impulse_scale) -> State:
+    """After each step, `[draw, time]`; velocities change at random before it."""
+    scene, keys = world.scene, jax.random.split(key, len(dt))
+
+    def alone(key, params, state, wrenches, dt, impulse_scale):
+        if impulse_scale is None:
+            return rollout(scene, params, state, wrenches, dt=dt)[0]
+        return _rollout_with_impulses(
+            key, scene, params, state, wrenches, dt, impulse_scale
         )
 
-    def advance(params, state, wrenches, dt, impulse_scale, key):
-        if impulse_scale is None:
-            states, _ = rollout(scene, params, state, wrenches, dt=dt)
-        else:
-            states = _rollout_with_impulses(
-                key, scene, params, state, wrenches, dt, impulse_scale
-            )
-        return jax.tree.map(lambda leaf: leaf[places], states)
+    def kicks_of(key, dt, impulse_scale):
+        still = State(jnp.zeros_like(start.pose[0]), jnp.zeros_like(start.twist[0]))
+        return jax.vmap(
+            lambda key: add_impulse(key, still, impulse_scale, scene.is_static).twist
+        )(jax.random.split(key, len(dt)))
 
-    keys = jax.random.split(kick_key, len(reading))
-    states = jax.vmap(advance)(params, start, wrenches, dt, impulse_scale, keys)
-    return add_reading_noise(
-        end_key, states, noise_scale[:, None], scene.is_static, freedom
-    ).array
+    if world.contact is None:
+        return jax.vmap(alone)(keys, params, start, wrenches, dt, impulse_scale)
+    kicks = None
+    if impulse_scale is not None:
+        kicks = jax.vmap(kicks_of)(keys, dt, impulse_scale)
+    return many_rollouts(world, params, start, wrenches, dt, kicks)
 
 
 def _rollout_with_impulses(key, scene, params, state, wrenches, dt, impulse_scale):
@@ -217,7 +235,7 @@ def _rollout_with_impulses(key, scene, params, state, wrenches, dt, impulse_scal
 @functools.partial(KeptJit, static=("horizons", "freedom"))
 def _predict_rows(
     key: Key,
-    scene: Scene,
+    world: WholeScene,
     params: Params,
     noise_scale: Float[Array, "draw body 4"],
     impulse_scale: Float[Array, "draw body 2"] | None,
@@ -247,7 +265,7 @@ def _predict_rows(
         following = jnp.minimum(row[:, None] + jnp.arange(horizons[-1])[None], last)
         readings = sample_readings(
             block_key,
-            scene,
+            world,
             jax.tree.map(lambda leaf: leaf[draw], params),
             noise_scale[draw],
             history.state[row] if states is None else states[draw, row],

@@ -6,6 +6,7 @@ hypothesis is filtered along the recording, and what it then holds probable of t
 is drawn from.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -16,10 +17,19 @@ from jaxtyping import Array, Bool, Float, Int
 from boomdp_jax.core.arrays import Key, on_device
 from boomdp_jax.core.history import History
 from boomdp_jax.core.quick_compile import KeptJit
-from boomdp_jax.inference.likelihoods.kalman import Estimate, NoiseLevel, RowFilter
+from boomdp_jax.inference.hypotheses.contact_prediction import ContactScene
+from boomdp_jax.inference.hypotheses.whole_motion import whole_scene
+from boomdp_jax.inference.likelihoods.kalman import (
+    Estimate,
+    NoiseLevel,
+    RowFilter,
+    principal_axes,
+)
 from boomdp_jax.inference.posteriors.posterior import Posterior
+from boomdp_jax.inference.readings.touching import find_touching
 from boomdp_jax.inference.readings.track_data import TrackData, track_data, with_delay
 from boomdp_jax.physics import Params, Scene
+from boomdp_jax.physics.scene_spec import SceneSpec
 
 STARTS = ("auto", "readings", "filtered")
 """What predictions may start from; `auto`: readings, where any is whole."""
@@ -28,6 +38,9 @@ STARTS = ("auto", "readings", "filtered")
 _STARTS_KEY = 1
 # Hypotheses that are filtered together.
 _AT_ONCE = 8
+# Noise of where walls are taken to be [m, rad, m/s, rad/s].
+_WALL_NOISE = 1e-5
+_PARTS = ("", "_mask")
 # Readings of a pose that say how fast it changes.
 _ENOUGH = 2
 
@@ -266,6 +279,10 @@ def filtered_starts(
         those last read; static bodies are where the row has them.
     """
     bodies = tuple(range(history.num_bodies))
+    spec, world = posterior.spec, whole_scene(posterior.spec)
+    reading = posterior.noise_scale
+    if world.contact is not None:
+        history, reading = _with_walls(spec, history, reading)
     mask, dt = np.asarray(history.mask), np.asarray(history.dt)
     is_uniform = bool(np.all(dt[mask] == dt[0]))
     actuator = posterior.params.actuator
@@ -276,15 +293,38 @@ def filtered_starts(
         has_delay=actuator is not None and actuator.delay is not None,
         freedom=posterior.degrees_of_freedom,
     )
-    noise = NoiseLevel(posterior.noise_scale, _impulses(posterior))
-    params = posterior.spec.with_surface(posterior.params)
-    drawn = _draw_starts(key, posterior.spec.scene, params, noise, data)
+    touching = find_touching(spec, history)
+    if touching is not None:
+        near = touching.near_rows(bodies, history.capacity)
+        data = dataclasses.replace(data, may_touch=on_device(near, bool))
+    noise = NoiseLevel(reading, _impulses(posterior))
+    params = spec.with_surface(posterior.params)
+    drawn = _draw_starts(key, world.filtered, params, noise, data)
     starts = np.array(drawn, np.float64)
     off = carried.pose[..., 2] - starts[..., 2]
     starts[..., 2] += 2.0 * np.pi * np.nan_to_num(np.round(off / (2.0 * np.pi)))
-    is_static = np.asarray(posterior.spec.scene.is_static)
+    is_static = np.asarray(spec.scene.is_static)
     starts[:, :, is_static] = np.asarray(history.state)[:, is_static]
     return on_device(starts, drawn.dtype)
+
+
+def _with_walls(
+    spec: SceneSpec, history: History, reading: Float[Array, "draw body 4"]
+) -> tuple[History, Float[Array, "draw body 4"]]:
+    """Readings of static bodies where the scene puts them, and next to no noise.
+
+    Likelihoods have them there; a wall that might be elsewhere would move what it hits.
+    """
+    is_static = np.asarray(spec.is_static) & np.all(np.isfinite(spec.pose), axis=-1)
+    pose = np.concatenate([spec.pose, np.zeros_like(spec.pose)], axis=-1)
+    filled: dict[str, Array] = {}
+    for name in ("state", "next_state"):
+        values, seen = (np.array(getattr(history, f"{name}{end}")) for end in _PARTS)
+        values[:, is_static], seen[:, is_static] = pose[is_static], True
+        filled[name] = on_device(values)
+        filled[f"{name}_mask"] = on_device(seen, bool)
+    scale = jnp.where(is_static[:, None], _WALL_NOISE, reading)
+    return dataclasses.replace(history, **filled), scale
 
 
 def _impulses(posterior: Posterior) -> Float[Array, "draw body 2"]:
@@ -295,11 +335,17 @@ def _impulses(posterior: Posterior) -> Float[Array, "draw body 2"]:
 
 @KeptJit
 def _draw_starts(
-    key: Key, scene: Scene, params: Params, noise: NoiseLevel, data: TrackData
+    key: Key,
+    scene: Scene | ContactScene,
+    params: Params,
+    noise: NoiseLevel,
+    data: TrackData,
 ) -> Float[Array, "draw time body 6"]:
     def draw_one(inputs):
         key, params, noise = inputs
-        row_filter = RowFilter(scene, params, data.steps.dt, noise, data.freedom)
+        row_filter = RowFilter(
+            scene, params, data.steps.dt, noise, data.freedom, bends=True
+        )
         rows = with_delay(params, data).rows
 
         def advance(before: Estimate, row):
@@ -318,10 +364,6 @@ def _draw_starts(
 def _draw_state(key: Key, estimate: Estimate) -> Float[Array, "body 6"]:
     """A state of a normal distribution that may know some directions for certain."""
     mean, covariance = estimate
-    variance = jnp.diagonal(covariance)
-    sd = jnp.sqrt(jnp.maximum(variance, jnp.finfo(mean.dtype).tiny))
-    value, vector = jnp.linalg.eigh(covariance / (sd[:, None] * sd[None]))
-    noise = jnp.sqrt(jnp.maximum(value, 0.0)) * jax.random.normal(
-        key, sd.shape, sd.dtype
-    )
-    return mean + (sd * (vector @ noise)).reshape(mean.shape)
+    axes = principal_axes(covariance)
+    noise = jax.random.normal(key, axes.shape[:1], axes.dtype)
+    return mean + (axes @ noise).reshape(mean.shape)
