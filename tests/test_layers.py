@@ -1,6 +1,7 @@
 """Who may import whom, what an import costs, and which names are public."""
 
 import ast
+import functools
 import json
 import subprocess
 import sys
@@ -51,9 +52,16 @@ def owner(path: Path) -> str:
     return parts[0] if len(parts) > 1 else ""
 
 
+@functools.cache
+def tree_of(path: Path) -> ast.Module:
+    """A file's syntax; several tests look at each."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@functools.cache
 def imports(path: Path) -> list[tuple[str, bool]]:
     """Dotted names that a file imports, and whether only when a function is called."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = tree_of(path)
     inside = {
         id(node)
         for function in ast.walk(tree)
@@ -73,11 +81,12 @@ def imports(path: Path) -> list[tuple[str, bool]]:
     return found
 
 
+@functools.cache
 def public_names() -> dict[str, list[str]]:
     """Every `__all__` of the package, read without importing anything."""
     found = {}
     for path in MODULES:
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        for node in tree_of(path).body:
             is_all = isinstance(node, ast.Assign) and any(
                 isinstance(target, ast.Name) and target.id == "__all__"
                 for target in node.targets
@@ -142,7 +151,7 @@ def test_optional_libraries_are_imported_by_their_owner_at_first_use(path):
 @pytest.mark.parametrize("path", MODULES, ids=name_of)
 def test_file_keeps_the_habits_of_the_package(path):
     text = path.read_text(encoding="utf-8")
-    tree = ast.parse(text)
+    tree = tree_of(path)
     assert ast.get_docstring(tree), f"{path} has no docstring"
     assert "from __future__ import annotations" not in text
     assert "jax.config." not in text
@@ -155,7 +164,7 @@ def test_init_files_hold_imports_and_names_only():
     for path in MODULES:
         if path.name != "__init__.py" or path.parent == PACKAGE:
             continue
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        for node in tree_of(path).body:
             is_docstring = isinstance(node, ast.Expr)
             is_plain = isinstance(node, ast.Import | ast.ImportFrom | ast.Assign)
             assert is_docstring or is_plain, f"{path}:{node.lineno}"
@@ -221,5 +230,8 @@ def test_import_takes_under_two_and_a_half_seconds():
         "print(time.perf_counter() - start)"
     )
     run_python(program)
-    fastest = min(float(run_python(program).stdout) for _ in range(3))
-    assert fastest < 2.5, f"import boomdp_jax took {fastest:.1f} s"
+    seconds = []
+    # One of three that is quick enough will do.
+    while len(seconds) < 3 and min(seconds, default=2.5) >= 2.5:
+        seconds.append(float(run_python(program).stdout))
+    assert min(seconds) < 2.5, f"import boomdp_jax took {min(seconds):.1f} s"

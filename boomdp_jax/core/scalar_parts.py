@@ -4,11 +4,9 @@ import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import jax
-import jax.core
-import jax.extend
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import Var
 
 _MOST_WHOLE = 2100
 """A function of at most so many operations stays whole.
@@ -53,75 +51,91 @@ def parts_of(
         The parts, one after the other. Truth values go from one to the next as zero
         and one.
     """
-    shapes = [jax.ShapeDtypeStruct((), aval.dtype) for aval in jaxpr.in_avals]
-    flat = jax.make_jaxpr(lambda *values: _evaluated(jaxpr, values, {}))(*shapes).jaxpr
-    equations = _needed(flat)
+    dtypes = [aval.dtype for aval in jaxpr.in_avals]
+    num_arguments, operations = len(dtypes), []
+    outcome = _opened(jaxpr, range(num_arguments), dtypes, operations, {})
+    operations = _needed(operations, outcome)
     num_parts = 1
-    if len(equations) > most_whole:
-        num_parts = -(-len(equations) // most)
+    if len(operations) > most_whole:
+        num_parts = -(-len(operations) // most)
     last_use = {
-        var: i for i, eqn in enumerate(equations) for var in _variables(eqn.invars)
+        v: i for i, each in enumerate(operations) for v in each.taken if type(v) is int
     }
-    last_use |= dict.fromkeys(_variables(flat.outvars), len(equations))
-    cuts = _cuts(equations, last_use, num_parts)
-    numbers = {var: i for i, var in enumerate(flat.invars)}
+    last_use |= {v: len(operations) for v in outcome if type(v) is int}
+    cuts = _cuts(operations, last_use, dtypes, num_parts)
+    numbers = {i: i for i in range(num_arguments)}
     parts = []
     for first, last in itertools.pairwise(cuts):
-        inside = equations[first:last]
+        inside = operations[first:last]
         # Ordered, as a dictionary is.
-        made = dict.fromkeys(var for eqn in inside for var in eqn.outvars)
-        used = [var for eqn in inside for var in _variables(eqn.invars)]
-        results = [var for var in made if last_use.get(var, -1) >= last]
-        if last == len(equations):
-            results = list(flat.outvars)
-            used += _variables(results)
-        taken = [var for var in dict.fromkeys(used) if var not in made]
+        made = dict.fromkeys(v for each in inside for v in each.made)
+        used = [v for each in inside for v in each.taken if type(v) is int]
+        results: list = [v for v in made if last_use.get(v, -1) >= last]
+        if last == len(operations):
+            results = outcome
+            used += [v for v in results if type(v) is int]
+        taken = {v: dtypes[v] for v in dict.fromkeys(used) if v not in made}
         # Where nothing is taken any value will do, to tell the type.
-        inputs = tuple(numbers[var] for var in taken) or (0,)
+        inputs = tuple(numbers[v] for v in taken) or (0,)
         parts.append(Part(_function(inside, taken, results), inputs, len(results)))
-        if last < len(equations):
-            numbers |= {var: len(numbers) + i for i, var in enumerate(results)}
+        if last < len(operations):
+            numbers |= {v: len(numbers) + i for i, v in enumerate(results)}
     return parts
 
 
-def _is_variable(atom) -> bool:
-    return isinstance(atom, jax.extend.core.Var)
+class _Operation(NamedTuple):
+    """One of a function's, with those that it calls opened up.
+
+    There are thousands, which is why what is done to each is written out where it is
+    done.
+    """
+
+    primitive: Any
+    params: dict
+    taken: list
+    """Values by number, or constants in a form that is written into the code."""
+    made: list[int]
 
 
-def _variables(atoms) -> list:
-    return [atom for atom in atoms if _is_variable(atom)]
-
-
-def _evaluated(jaxpr, values, done: dict) -> list:
-    """What a closed function yields, with the functions that it calls opened up.
+def _opened(
+    jaxpr: Any, values: Sequence, dtypes: list, operations: list, done: dict
+) -> list:
+    """Add a closed function's operations to those before it.
 
     Args:
         jaxpr: the function.
-        values: its arguments.
-        done: operations that need not be done again, and their results.
+        values: its arguments, by number, or constants.
+        dtypes: of the values so far; added to.
+        operations: so far; added to.
+        done: results of operations that need not be done again; added to.
 
     Returns:
-        Its results.
+        Its results, as `values`.
     """
     known = dict(zip(jaxpr.jaxpr.invars, values, strict=True))
     known |= dict(zip(jaxpr.jaxpr.constvars, map(_number, jaxpr.consts), strict=True))
     for eqn in jaxpr.jaxpr.eqns:
-        taken = [_read(atom, known) for atom in eqn.invars]
+        taken = [
+            known[atom] if isinstance(atom, Var) else _number(atom.val)
+            for atom in eqn.invars
+        ]
         called = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
         if called is not None:
-            out = _evaluated(called, taken, done)
+            out = _opened(called, taken, dtypes, operations, done)
         else:
-            names = [
-                id(v) if isinstance(v, jax.core.Tracer) else (repr(v), v.dtype)
-                for v in taken
-            ]
+            names = [v if type(v) is int else (repr(v), v.dtype) for v in taken]
             key = (eqn.primitive, repr(eqn.params), *names)
             if key not in done:
-                # The values stay with it: a name is unique among what is alive.
-                done[key] = taken, _applied(eqn, taken)
-            out = done[key][1]
+                done[key] = [len(dtypes) + i for i in range(len(eqn.outvars))]
+                dtypes += [var.aval.dtype for var in eqn.outvars]
+                each = _Operation(eqn.primitive, eqn.params, taken, done[key])
+                operations.append(each)
+            out = done[key]
         known |= dict(zip(eqn.outvars, out, strict=True))
-    return [_read(atom, known) for atom in jaxpr.jaxpr.outvars]
+    return [
+        known[atom] if isinstance(atom, Var) else _number(atom.val)
+        for atom in jaxpr.jaxpr.outvars
+    ]
 
 
 def _number(const):
@@ -129,39 +143,31 @@ def _number(const):
     return np.asarray(const)[()]
 
 
-def _read(atom, known):
-    return known[atom] if _is_variable(atom) else _number(atom.val)
-
-
-def _applied(eqn, values) -> list:
-    out = eqn.primitive.bind(*values, **eqn.params)
-    return list(out) if eqn.primitive.multiple_results else [out]
-
-
-def _needed(flat) -> list:
+def _needed(operations: list, outcome: list) -> list:
     """The operations that results depend on."""
-    wanted, kept = set(_variables(flat.outvars)), []
-    for eqn in reversed(flat.eqns):
-        if wanted.intersection(eqn.outvars):
-            kept.append(eqn)
-            wanted.update(_variables(eqn.invars))
+    wanted, kept = {v for v in outcome if type(v) is int}, []
+    for each in reversed(operations):
+        if wanted.intersection(each.made):
+            kept.append(each)
+            wanted.update(v for v in each.taken if type(v) is int)
     return kept[::-1]
 
 
-def _cuts(equations: list, last_use: dict, num_parts: int) -> list[int]:
+def _cuts(operations: list, last_use: dict, dtypes: list, num_parts: int) -> list[int]:
     """Where parts begin and end: near equal lengths, where little is alive."""
-    num = len(equations)
+    num, cuts = len(operations), [0]
+    if num_parts == 1:
+        return [0, num]
     change = np.zeros(num + 2)
-    for i, eqn in enumerate(equations):
-        for var in eqn.outvars:
-            is_integer = jnp.issubdtype(var.aval.dtype, jnp.integer)
+    for i, each in enumerate(operations):
+        for value in each.made:
+            is_integer = jnp.issubdtype(dtypes[value], jnp.integer)
             cost = _INTEGER_COST if is_integer else 1.0
             # Alive at the borders after it, up to its last use.
             change[i + 1] += cost
-            change[last_use.get(var, i) + 1] -= cost
+            change[last_use.get(value, i) + 1] -= cost
     alive = np.cumsum(change)
     slack = int(_SLACK * num / num_parts)
-    cuts = [0]
     for k in range(1, num_parts):
         middle = k * num // num_parts
         first = max(middle - slack, cuts[-1] + 1)
@@ -169,18 +175,19 @@ def _cuts(equations: list, last_use: dict, num_parts: int) -> list[int]:
     return [*cuts, num]
 
 
-def _function(equations: list, taken: list, results: Sequence) -> Callable[..., list]:
+def _function(operations: list, taken: dict, results: list) -> Callable[..., list]:
     """Those operations, from floating scalars to floating scalars."""
 
     def function(*values):
         dtype = values[0].dtype
         known = {}
-        for var, value in zip(taken, values, strict=False):
-            is_truth = var.aval.dtype == jnp.bool_
-            known[var] = value != 0 if is_truth else jnp.asarray(value, var.aval.dtype)
-        for eqn in equations:
-            out = _applied(eqn, [_read(atom, known) for atom in eqn.invars])
-            known |= dict(zip(eqn.outvars, out, strict=True))
-        return [jnp.asarray(_read(atom, known), dtype) for atom in results]
+        for (v, kind), value in zip(taken.items(), values, strict=False):
+            known[v] = value != 0 if kind == jnp.bool_ else jnp.asarray(value, kind)
+        for each in operations:
+            given = [known[v] if type(v) is int else v for v in each.taken]
+            out = each.primitive.bind(*given, **each.params)
+            out = out if each.primitive.multiple_results else [out]
+            known |= dict(zip(each.made, out, strict=True))
+        return [jnp.asarray(known[v] if type(v) is int else v, dtype) for v in results]
 
     return function

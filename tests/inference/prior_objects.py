@@ -53,6 +53,21 @@ def box_scene() -> SceneSpec:
     )
 
 
+class _Drawn(NamedTuple):
+    """All that is random about objects but what their steps end at."""
+
+    targets: StructureTarget
+    """Of them only what does not depend on readings is of use."""
+    structure: np.ndarray
+    z: np.ndarray
+    noise_scale: np.ndarray
+    state: np.ndarray
+    """That steps start from, `[object, row, 1, 6]`."""
+    wrench: np.ndarray
+    noise: np.ndarray
+    """Of what they end at, in sds."""
+
+
 def draw_objects(
     rng: np.random.Generator, num_objects: int, num_rows: int
 ) -> PriorObjects:
@@ -62,23 +77,19 @@ def draw_objects(
     likelihood has it; what it ends at is read with noise whose scales follow their
     prior.
     """
-    spec = box_scene()
+    drawn = _draw(rng, num_objects, num_rows)
+    truth = _predict(drawn)
+    sd = drawn.noise_scale[:, None, None, [0, 0, 1, 2, 2, 3]]
+    histories = _histories(drawn.state, drawn.wrench, truth + sd * drawn.noise)
+    targets = _stacked(histories)
+    return PriorObjects(targets, drawn.structure, drawn.z, drawn.noise_scale, histories)
+
+
+def _draw(rng: np.random.Generator, num_objects: int, num_rows: int) -> _Drawn:
     state = rng.normal(size=(num_objects, num_rows, 1, 6)) * _STATE
-    mass = 30.0 * float(spec.scene.area[0])
+    mass = 30.0 * float(box_scene().scene.area[0])
     wrench = rng.normal(size=(num_objects, num_rows, 1, 3)) * _WRENCH * mass
-    episode = np.arange(num_rows)
-
-    def histories_of(next_state: np.ndarray) -> list[History]:
-        return [
-            make_history(s, a, n, DT, episode=episode)
-            for s, a, n in zip(state, wrench, next_state, strict=True)
-        ]
-
-    def stacked(histories: list[History]) -> StructureTarget:
-        return stack_blocks([make_block(spec, (0,), each) for each in histories])
-
-    # Of targets only what does not depend on readings is used here.
-    targets = stacked(histories_of(state))
+    targets = _stacked(_histories(state, wrench, state))
     probability = np.exp(np.asarray(targets.log_prior[0], float))
     structure = rng.choice(
         len(probability), size=num_objects, p=probability / probability.sum()
@@ -89,14 +100,24 @@ def draw_objects(
     slots = np.asarray(targets.structures[0])
     active = np.concatenate([slots, np.ones((len(slots), 1), bool)], axis=1)
     z = np.where(active[:, np.asarray(targets.slot[0])][structure], z, 0.0)
-    truth = _predict(targets, structure, z, state, wrench)
     likelihood: Any = targets.log_likelihood
     scale = np.asarray(likelihood.coordinates.scales.noise, float)[0]
     variance = scale**2 / rng.gamma(1.0, size=(num_objects, 4))
-    noise_scale = np.sqrt(variance)
-    sd = noise_scale[:, None, None, [0, 0, 1, 2, 2, 3]]
-    histories = histories_of(truth + sd * rng.standard_normal(truth.shape))
-    return PriorObjects(stacked(histories), structure, z, noise_scale, histories)
+    noise = rng.standard_normal(state.shape)
+    return _Drawn(targets, structure, z, np.sqrt(variance), state, wrench, noise)
+
+
+def _histories(state, wrench, next_state) -> list[History]:
+    episode = np.arange(state.shape[1])
+    return [
+        make_history(s, a, n, DT, episode=episode)
+        for s, a, n in zip(state, wrench, next_state, strict=True)
+    ]
+
+
+def _stacked(histories: list[History]) -> StructureTarget:
+    spec = box_scene()
+    return stack_blocks([make_block(spec, (0,), each) for each in histories])
 
 
 class PriorTracks(NamedTuple):
@@ -120,7 +141,7 @@ def draw_tracks(
     States are latent: a body starts somewhere, is kicked before each step and pushed
     during it, and is read once an instant.
     """
-    base = draw_objects(rng, num_objects, num_rows)
+    base = _draw(rng, num_objects, num_rows)
     likelihood: Any = base.targets.log_likelihood
     scale = np.asarray(likelihood.coordinates.scales.noise, float)[0]
     reading, impulse = prior_noise(rng, scale, (num_objects, 1))
@@ -174,11 +195,12 @@ def _step_all(coordinates, z, active, state, wrench):
     return jax.vmap(one_object)(coordinates, z, active, state, wrench)
 
 
-def _predict(targets, structure, z, state, wrench) -> np.ndarray:
+def _predict(drawn: _Drawn) -> np.ndarray:
     """Where every step ends, without noise."""
+    targets = drawn.targets
     likelihood: Any = targets.log_likelihood
     dtype = targets.log_prior.dtype
-    active = np.asarray(targets.structures[0])[structure]
-    arrays = (np.asarray(x, dtype) for x in (state, wrench))
-    found = _step_all(likelihood.coordinates, np.asarray(z, dtype), active, *arrays)
-    return np.asarray(found, float)
+    active = np.asarray(targets.structures[0])[drawn.structure]
+    given = drawn.z, drawn.state, drawn.wrench
+    z, *moved = (np.asarray(x, dtype) for x in given)
+    return np.asarray(_step_all(likelihood.coordinates, z, active, *moved), float)

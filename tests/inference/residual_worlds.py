@@ -1,5 +1,9 @@
-"""Boxes that obey some law: pushed at random, in small steps, and read with noise."""
+"""Boxes that obey some law: pushed at random, in small steps, and read with noise.
 
+The same law is the same function, so that what was computed of it can be kept.
+"""
+
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -20,6 +24,7 @@ def nothing_else(state: np.ndarray, wrench: np.ndarray) -> np.ndarray:
     return wrench
 
 
+@functools.cache
 def viscous(coefficient: float) -> Force:
     """Drag in proportion to velocity [N s/m]."""
 
@@ -29,6 +34,7 @@ def viscous(coefficient: float) -> Force:
     return force
 
 
+@functools.cache
 def dry(size: float) -> Force:
     """Coulomb friction at the centre of mass [N]."""
 
@@ -39,6 +45,7 @@ def dry(size: float) -> Force:
     return force
 
 
+@functools.cache
 def slope(x: float, y: float) -> Force:
     """A constant force [N]."""
 
@@ -48,6 +55,7 @@ def slope(x: float, y: float) -> Force:
     return force
 
 
+@functools.cache
 def lever(x: float, y: float) -> Force:
     """Forces act at a point of the body's frame [m], not at its centre of mass."""
 
@@ -59,6 +67,7 @@ def lever(x: float, y: float) -> Force:
     return force
 
 
+@functools.cache
 def inertia(ratio: float) -> Force:
     """The same mass with so many times the inertia."""
 

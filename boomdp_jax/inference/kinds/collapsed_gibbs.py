@@ -9,6 +9,8 @@ some hundred likelihoods for each object, and a few for whole kinds. Prefer it t
 `stick_breaking` where objects say much: a new kind fits its first object.
 """
 
+import functools
+
 import numpy as np
 
 from boomdp_jax.inference.kinds.concentration import draw_concentration
@@ -142,11 +144,7 @@ def _move(rng, data: KindData, state: KindState, i, new_slot, is_nudge) -> float
     sums = [x[..., :dim] for x in (tallies.num, tallies.first, tallies.second)]
     spread = state.spread[..., :dim]
     mean, variance = part.predictive(*sums, spread)
-
-    def log_exact(chain: np.ndarray, kind: np.ndarray, z: np.ndarray) -> np.ndarray:
-        of_kind = (x[chain, kind] for x in sums)
-        return part.log_predictive(z, *of_kind, spread[chain, kind])
-
+    log_exact = functools.partial(part.log_given_sums, sums, spread)
     kinds = Kinds(
         log_weight, log_structure(data, tallies.structure), mean, variance, log_exact
     )

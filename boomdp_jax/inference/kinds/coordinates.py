@@ -11,6 +11,7 @@ section 12.5).
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -187,6 +188,26 @@ class CoordinateModel:
                 - np.log(self.period[a])
             )
         return out
+
+    def log_given_sums(
+        self,
+        sums: Sequence[np.ndarray],
+        spread: np.ndarray,
+        row: np.ndarray,
+        kind: np.ndarray,
+        z: np.ndarray,
+    ) -> np.ndarray:
+        """`log_predictive` of points whose kinds are chosen from some, `[point, dim]`.
+
+        Args:
+            sums: `num`, `first` and `second` of `Tallies`, `[row, kind, dim]` each.
+            spread: index of each coordinate's, `[row, kind, dim]`.
+            row: of each point.
+            kind: of each point.
+            z: coordinates of points.
+        """
+        of_kind = (x[row, kind] for x in sums)
+        return self.log_predictive(z, *of_kind, spread[row, kind])
 
     def draw_predictive(
         self,

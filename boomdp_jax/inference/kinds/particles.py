@@ -17,6 +17,7 @@ before it a kind's spreads are auxiliary to the next object, which then has, the
 integrated out, its exact conditional density.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -273,11 +274,7 @@ class _Part:
         )
         spread[own_points, side[own_points]] = own_spread
         mean, variance = model.predictive(*sums, spread)
-
-        def log_exact(point: np.ndarray, kind: np.ndarray, z: np.ndarray) -> np.ndarray:
-            of_kind = (x[point, kind] for x in sums)
-            return model.log_predictive(z, *of_kind, spread[point, kind])
-
+        log_exact = functools.partial(model.log_given_sums, sums, spread)
         bumps = data.bumps[i]
         assert bumps is not None
         log_structures = log_structure(data, tallies.structure)

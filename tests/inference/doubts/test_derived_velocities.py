@@ -1,5 +1,7 @@
 """Velocities computed from poses: which recordings are named, and which are not."""
 
+import functools
+
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
@@ -33,8 +35,11 @@ def history_of(states, dt=DT, **options):
     return make_history(rows[:-1], action, rows[1:], dt, **options)
 
 
+_scene = functools.cache(box_scene)
+
+
 def reasons_of(states, dt=DT, **options):
-    return derived_velocity_reasons(box_scene(), history_of(states, dt, **options))
+    return derived_velocity_reasons(_scene(), history_of(states, dt, **options))
 
 
 def gradient(pose):

@@ -1,6 +1,7 @@
 """Drawers and doors of MuJoCo's that come against stops, and such that do not."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -39,10 +40,24 @@ SPEC = scene_spec_from_dict(
 )
 
 
+Table = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""States, wrenches and next states."""
+
+
 def recording(
     kind: str, seed: int, *, end: float | None, poses_only: bool = False, **law: float
 ) -> History:
     """A thing pushed at random in four runs, from rest between its ends."""
+    state, wrench, next_state = (part.copy() for part in _table(kind, seed, end, **law))
+    if poses_only:
+        state[..., 3:] = next_state[..., 3:] = np.nan
+    episode = np.arange(NUM_ROWS) // ROWS_OF_RUN
+    return make_history(state, wrench, next_state, DT, episode=episode)
+
+
+@functools.cache
+def _table(kind: str, seed: int, end: float | None, **law: float) -> Table:
+    """What is read of all channels; 10,000 steps of MuJoCo's that many tests take."""
     limit = "" if end is None else f'limited="true" range="{-end} {end}"'
     more = " ".join(f'{name}="{value}"' for name, value in law.items())
     model: Any = mujoco.MjModel.from_xml_string(
@@ -78,10 +93,7 @@ def recording(
         reading = read() + NOISE * rng.standard_normal(6)
         next_state[row, 0] = reading
     state[..., 2] = _continued(state[..., 2], next_state[..., 2])
-    if poses_only:
-        state[..., 3:] = next_state[..., 3:] = np.nan
-    episode = np.arange(NUM_ROWS) // ROWS_OF_RUN
-    return make_history(state, wrench, next_state, DT, episode=episode)
+    return state, wrench, next_state
 
 
 def _continued(angle, next_angle):
@@ -114,8 +126,11 @@ def posterior_of(kind: str):
     return make_posterior(SPEC, params, params, inferred=inferred)
 
 
+_kept_posterior = functools.cache(posterior_of)
+
+
 def reasons(kind: str, history: History) -> list[str]:
-    return end_stop_reasons(SPEC, history, posterior_of(kind))
+    return end_stop_reasons(SPEC, history, _kept_posterior(kind))
 
 
 @pytest.mark.parametrize("poses_only", [False, True])

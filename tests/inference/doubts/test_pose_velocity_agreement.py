@@ -1,5 +1,8 @@
 """Velocities that poses contradict: which recordings are named, and which are not."""
 
+import copy
+import functools
+
 import numpy as np
 import pytest
 
@@ -41,20 +44,30 @@ def read(rng, states, noise=NOISE):
     return states + noise * rng.normal(size=states.shape)
 
 
+_scene = functools.cache(box_scene)
+
+
 def reasons_of(states, dt=DT, **options):
     """Reasons for doubt; where there are none, notes."""
     rows = states[:, None]
     action = np.zeros((len(rows) - 1, 1, 3))
     history = make_history(rows[:-1], action, rows[1:], dt, **options)
-    reasons = pose_velocity_reasons(box_scene(), history)
-    notes = pose_velocity_notes(box_scene(), history)
+    reasons = pose_velocity_reasons(_scene(), history)
+    notes = pose_velocity_notes(_scene(), history)
     assert not (reasons and notes)
     return reasons + notes
 
 
 def pushed(seed, num=60, force=nothing_else, noise=NOISE, **options):
+    states, rng = _moved(seed, num, force, **options)
+    return read(copy.deepcopy(rng), states, noise)
+
+
+@functools.cache
+def _moved(seed, num, force, **options):
+    """States, and the generator as it then is: many tests read one motion anew."""
     rng = np.random.default_rng(seed)
-    return read(rng, states_of(rng, np.full(num, DT), force, **options), noise)
+    return states_of(rng, np.full(num, DT), force, **options), rng
 
 
 def differenced(states, smoothing=1.0):

@@ -106,10 +106,11 @@ def check_chain_means(values: np.ndarray, expected, false_alarm: float = 1e-4) -
 
 @pytest.fixture(scope="module", params=["collapsed", "sticks"])
 def sampled(request):
+    # Four times the chains are two thirds more work for each sweep.
     settings = KindSettings(
-        num_chains=64,
-        num_warmup=60,
-        num_samples=150,
+        num_chains=256,
+        num_warmup=40,
+        num_samples=40,
         sampler=request.param,
         concentration=CONCENTRATION,
     )

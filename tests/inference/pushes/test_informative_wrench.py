@@ -147,7 +147,7 @@ def boxes(spread, *, seed=0, noise=(1e-3, 1e-3, 5e-3, 5e-3), spec=None, **slots)
     return make_posterior(spec, params, params, noise_scale=noise)
 
 
-@pytest.mark.parametrize("num_draws", [64, 256])
+@pytest.mark.parametrize("num_draws", [pytest.param(64, marks=pytest.mark.slow), 256])
 @pytest.mark.parametrize("scale", [1.0, 0.1])
 def test_what_no_push_can_tell_is_not_told(num_draws, scale):
     """A wheel that brakes nothing, however well readings tell draws from each other."""
