@@ -17,6 +17,17 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from boomdp_jax.inference.doubts.corrections import (
+    Persistence,
+    moved_by_readings,
+    persistence_by_body,
+)
+from boomdp_jax.inference.doubts.less_noise import (
+    NUM_RIVALS,
+    group_scale,
+    is_worth_asking,
+    weighed_again,
+)
 from boomdp_jax.inference.doubts.residual_laws import LAWS, Law, Path
 from boomdp_jax.inference.doubts.residual_regression import (
     LawFit,
@@ -25,13 +36,13 @@ from boomdp_jax.inference.doubts.residual_regression import (
     white_by_body,
 )
 from boomdp_jax.inference.doubts.residual_spread import SpreadGrowth, spread_growth
+from boomdp_jax.inference.doubts.responses import Responses
 from boomdp_jax.inference.doubts.step_doubts import Linearised, StepError, step_error
 from boomdp_jax.inference.doubts.uneven_clock import ClockError, clock_error
 from boomdp_jax.inference.fits.fit import Host
 from boomdp_jax.inference.hypotheses.body_numbers import get_number
 from boomdp_jax.inference.hypotheses.decode import decode
 from boomdp_jax.inference.hypotheses.noise_level import NoiseFit
-from boomdp_jax.inference.likelihoods.evaluate import pushed_innovations
 from boomdp_jax.inference.likelihoods.filter_points import filter_points
 from boomdp_jax.inference.likelihoods.kalman import Filtered
 from boomdp_jax.inference.likelihoods.target import StructureTarget
@@ -41,18 +52,6 @@ from boomdp_jax.physics.actuator import delayed
 
 FEWEST_ROWS = 12
 """Steps below which nothing is looked for."""
-
-_GROUPS = ((0, 1), (2,), (3, 4), (5,))
-_GROUP = np.array([0, 0, 1, 2, 2, 3])
-# Differences are taken over so much: first pushes as a share of the motion's noise, and
-# moves in prior sds; then what changes all innovations together by so much, so that
-# rounding in single precision does not tell, nor curvature.
-_FIRST_PUSH, _FIRST_MOVE = 0.3, 1e-2
-_PUSH_CHANGE, _MOVE_CHANGE = 3.0, 0.3
-_MOVES = (1e-3, 3e-2)
-# Least noise of the motion that the first push is measured by, as a share of readings'.
-_LEAST_NOISE = 0.01
-_POINTS = 16
 
 
 class BodyLaw(NamedTuple):
@@ -81,6 +80,11 @@ class ResidualCheck(NamedTuple):
     """What finer steps would change; None: it was not asked."""
     clock: ClockError | None = None
     """How much steps vary in length; None: it was not asked."""
+    persistence: tuple[dict[str, Persistence], ...] = ()
+    """Of each body, by channel group of the twist, how corrections of it add up."""
+    by_chance: tuple[float, ...] = ()
+    """Of each body, changes of velocity by noise of the motion per those that what
+    pushes it would make alone; zero where nothing pushes it."""
 
 
 def check_residuals(targets: StructureTarget, draws: BlockDraws) -> list[ResidualCheck]:
@@ -172,25 +176,39 @@ class _Block:
         host = Host.of(targets)
         self._used = np.flatnonzero(host.in_use[structure])
         self._is_normal = host.is_normal[self._used]
+        self._responses = Responses(
+            targets,
+            index,
+            structure,
+            z,
+            self._used,
+            noise,
+            filtered,
+            self._command,
+            self._gain,
+            self._inertia,
+            self._dt,
+        )
 
     def check(self) -> ResidualCheck:
         """Regress innovations on every law of every body."""
-        counts = self._counts()
+        counts = self._responses.counts
         rows = np.flatnonzero(counts[:, 1].any(axis=(1, 2)))
-        base = self._innovations(self._z[None, None])[0, 0]
+        base = self._responses.innovations(self._z[None, None])[0, 0]
         if not np.all(np.isfinite(base)):
             return ResidualCheck(len(rows), [], [])
-        before, after = self._states(base)
+        first, last = moved_by_readings(self._filtered.gains, base)
+        before, after = self._states(first, last)
         paths = self._paths(0.5 * (before + after))
         pushes = [
             (body, law, np.stack(law.wrench(path)))
             for body, path in enumerate(paths)
             for law in LAWS
         ]
-        scale = _group_scale(base, counts)
-        moves = self._by_moves(base, scale)
+        scale = group_scale(base, counts)
+        moves = self._responses.by_moves(base, scale)
         wrenches = [(body, push) for body, _, each in pushes for push in each]
-        answers = self._by_pushes(base, scale, wrenches)
+        answers = self._responses.by_pushes(base, scale, wrenches)
 
         def flat(values: np.ndarray) -> np.ndarray:
             return values[..., rows, :, :, :].reshape(*values.shape[:-4], len(rows), -1)
@@ -205,6 +223,7 @@ class _Block:
             fit = fit_law(known, flat(columns))
             if fit is not None:
                 found.append(BodyLaw(body, law, fit))
+        found = self._with_less_noise(found, paths, rows)
         found.sort(key=lambda one: -one.fit.log_bayes_factor)
         growth = self._growth(base, counts, paths)
         track = np.cumsum(np.asarray(self._data.is_start) > 0)
@@ -214,57 +233,69 @@ class _Block:
         best = Linearised(*place, self._command, *known_moves)
         step = step_error(best, self._others)
         clock = self._clock(base, before, after)
-        return ResidualCheck(len(rows), found, white, growth, correlated, step, clock)
+        going_on = persistence_by_body(first, last, track)
+        return ResidualCheck(
+            len(rows),
+            found,
+            white,
+            growth,
+            correlated,
+            step,
+            clock,
+            going_on,
+            self._by_chance(rows),
+        )
 
-    def _counts(self) -> np.ndarray:
-        counts = self._filtered.gains.counts
-        return np.asarray(counts).reshape(len(self._command), 2, -1, 6)
+    def _by_chance(self, rows: np.ndarray) -> tuple[float, ...]:
+        kick = self._wrench[rows, :, :2] * self._dt[rows, None, None]
+        kick = np.sqrt(np.mean(np.sum(kick**2, axis=2), axis=0))
+        noise = np.sqrt(2.0) * self._noise.impulse[0, :, 0] * self._inertia[:, 0]
+        share = np.where(kick > 0.0, noise / np.where(kick > 0.0, kick, 1.0), 0.0)
+        return tuple(float(each) for each in share)
 
-    def _innovations(
-        self, z: np.ndarray, extra: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Whitened, of lists of points, each list with further commands.
+    def _with_less_noise(
+        self, found: list[BodyLaw], paths: list[Path], rows: np.ndarray
+    ) -> list[BodyLaw]:
+        """The same laws, those of axes that hold all along at less noise as well.
 
-        Args:
-            z: coordinates, `[list, point, dim]`.
-            extra: commands, `[list, time, body, 3]`; None: none.
+        Unless with less noise another law explains more, of which these are a part.
         """
-        action = np.broadcast_to(self._command, (len(z), *self._command.shape))
-        if extra is not None:
-            action = action + extra
-        gains = jax.tree.map(
-            lambda leaf: np.broadcast_to(leaf, (len(z), *leaf.shape)),
-            self._filtered.gains,
-        )
-        return pushed_innovations(
-            self._targets,
-            np.full(len(z), self._index),
-            np.full(len(z), self._structure),
-            gains,
-            action,
-            z,
-        )
+        axes = [x for x in found if x.law.is_of_axes and is_worth_asking(x.fit)]
+        if not axes:
+            return found
+        others = [one for one in found if not one.law.is_of_axes]
+        others.sort(key=lambda one: -one.fit.log_bayes_factor)
+        asked = [*axes, *others[:NUM_RIVALS]]
+        wrenches = [
+            (one.body, push)
+            for one in asked
+            for push in one.law.wrench(paths[one.body])
+        ]
+        levels = [
+            each.at_noise(wrenches, rows)
+            for each in (self._responses, *self._responses.quieter())
+        ]
+        z = self._z[self._used]
+        fits = weighed_again([one.fit for one in asked], levels, z, self._is_normal)
+        best = max(range(len(asked)), key=lambda place: fits[place].log_bayes_factor)
+        if best >= len(axes):
+            return found
+        again = [one._replace(fit=fit) for one, fit in zip(axes, fits, strict=False)]
+        return again + [one for one in found if not any(one is each for each in axes)]
 
-    def _states(self, innovation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _states(
+        self, first: np.ndarray, last: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """At both ends of each step, by what is known before its end is read.
 
         What is read there must not enter what it is regressed on.
+
+        Args:
+            first: by how much the reading that a step starts from moved the estimate.
+            last: the reading that ends it.
         """
-        gains = self._filtered.gains
-        shape = (len(self._command), -1, 6)
-
-        def moved(gain, whitening, error) -> np.ndarray:
-            """By how much a reading moves the estimate."""
-            seen = np.diagonal(whitening, axis1=1, axis2=2) > 0
-            root = whitening + np.eye(seen.shape[1]) * ~seen[:, None]
-            miss = np.linalg.solve(root, error.reshape(len(error), -1, 1))
-            return (gain @ miss)[..., 0].reshape(shape)
-
-        parts = jax.tree.map(lambda leaf: np.asarray(leaf, float), gains)
-        before = np.asarray(self._filtered.starts, float)
-        before = before + moved(parts.first, parts.first_whitening, innovation[:, 0])
-        after = np.asarray(self._filtered.after.mean, float)
-        after = after - moved(parts.last, parts.last_whitening, innovation[:, 1])
+        before = np.asarray(self._filtered.starts, float).reshape(first.shape) + first
+        after = np.asarray(self._filtered.after.mean, float).reshape(last.shape) - last
         return before, after
 
     def _clock(
@@ -303,53 +334,6 @@ class _Block:
             paths.append(Path(place[:, :3], place[:, 3:], *applied, *rest))
         return paths
 
-    def _by_moves(self, base: np.ndarray, scale: np.ndarray) -> np.ndarray:
-        """Derivative by coordinates in use, `[coordinate, time, 2, body, 6]`."""
-        num = len(self._used)
-
-        def change(step: np.ndarray) -> np.ndarray:
-            moved = np.tile(self._z, (num, 1))
-            moved[np.arange(num), self._used] += step
-            moved = np.pad(moved, ((0, -num % _POINTS), (0, 0)), mode="edge")
-            found = self._innovations(moved.reshape(-1, _POINTS, len(self._z)))
-            found = found.reshape(-1, *base.shape)[:num]
-            return (found - base) / scale
-
-        if not num:
-            return np.zeros((0, *base.shape))
-        step = np.full(num, _FIRST_MOVE)
-        slope = _length(change(step)) / step
-        step = np.clip(_MOVE_CHANGE / np.maximum(slope, 1e-9), *_MOVES)
-        return np.nan_to_num(change(step) / step[:, None, None, None, None])
-
-    def _by_pushes(
-        self, base: np.ndarray, scale: np.ndarray, wrenches: list
-    ) -> np.ndarray:
-        """The same by pushes of bodies, `[push, time, 2, body, 6]`."""
-        noise = np.maximum(
-            self._noise.impulse[0], _LEAST_NOISE * self._noise.reading[0][:, 2:]
-        )[:, [0, 0, 1]]
-        unit, extra = [], []
-        for body, push in wrenches:
-            kick = push * self._dt[:, None] / self._inertia[body] / noise[body]
-            size = np.sqrt(np.mean(np.sum(kick**2, axis=1)))
-            unit.append(_FIRST_PUSH / size if size > 0 else 0.0)
-            whole = np.zeros_like(self._command)
-            whole[:, body] = push / self._gain[body]
-            extra.append(whole)
-        unit, extra = np.array(unit), np.stack(extra)
-
-        def change(step: np.ndarray) -> np.ndarray:
-            z = np.tile(self._z, (len(step), 1, 1))
-            found = self._innovations(z, step[:, None, None, None] * extra)[:, 0]
-            return (found - base) / scale
-
-        slope = _length(change(unit)) / np.where(unit > 0, unit, 1.0)
-        step = np.where(slope > 0, _PUSH_CHANGE / np.where(slope > 0, slope, 1.0), unit)
-        step = np.clip(step, 1e-3 * unit, 1e3 * unit)
-        safe = np.where(step > 0, step, 1.0)
-        return change(step) / safe[:, None, None, None, None]
-
     def _growth(
         self, base: np.ndarray, counts: np.ndarray, paths: list[Path]
     ) -> tuple[SpreadGrowth | None, ...]:
@@ -367,26 +351,3 @@ def _from_edges(is_start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     begin = np.maximum.accumulate(np.where(is_start, row, 0))
     last = np.where(np.append(is_start[1:], True), row, len(row))
     return row - begin, np.minimum.accumulate(last[::-1])[::-1] - row
-
-
-def _length(change: np.ndarray) -> np.ndarray:
-    """Root of the sum of squares of each."""
-    return np.sqrt(np.sum(change**2, axis=(1, 2, 3, 4)))
-
-
-def _group_scale(innovation: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """How much larger innovations of a channel group are than they should be, or one.
-
-    The draw's noise is one of many; where it is low, that would be evidence for
-    anything.
-    """
-    square = np.sum(innovation**2, axis=(0, 1))
-    num = np.sum(counts, axis=(0, 1))
-    out = np.ones_like(square)
-    for group in _GROUPS:
-        channels = list(group)
-        each = square[:, channels].sum(axis=1) / np.maximum(
-            num[:, channels].sum(axis=1), 1.0
-        )
-        out[:, channels] = np.sqrt(np.maximum(each, 1.0))[:, None]
-    return out

@@ -10,6 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+# One less the length of the mean of a body's axis while it is pushed, about half the
+# variance of its angle, from which it turns enough to tell its axes from turned ones.
+_LEAST_TURNED = 0.001
+
 
 class Path(NamedTuple):
     """Where a body was in the middle of each step, and what pushed it."""
@@ -41,6 +45,10 @@ class Law(NamedTuple):
     unit: str
     wrench: Callable[[Path], list[Float[np.ndarray, "time 3"]]]
     """Per unit of each coefficient."""
+    meaning: Callable[[np.ndarray], str] | None = None
+    """What coefficients come to, for people."""
+    is_of_axes: bool = False
+    """Whether it says how axes of wrenches lie; see `less_noise`."""
 
 
 def _along(direction: np.ndarray, size: np.ndarray) -> np.ndarray:
@@ -109,6 +117,44 @@ def _limited(part: np.ndarray, place: int = 0) -> np.ndarray:
     return wrench
 
 
+def _quarter_turned(path: Path) -> np.ndarray:
+    """The applied force turned counterclockwise by a quarter turn."""
+    x, y, _ = path.wrench.T
+    return np.column_stack([-y, x, np.zeros(len(x))])
+
+
+def _mirrored(path: Path, matrix: np.ndarray) -> np.ndarray:
+    """What the applied force has beyond itself where it is mirrored."""
+    change = path.wrench[:, :2] @ (matrix - np.eye(2)).T
+    return np.column_stack([change, np.zeros(len(change))])
+
+
+def _out_of_own_frame(path: Path) -> np.ndarray:
+    """What a force of these components along the body's own axes has beyond it.
+
+    Nothing where the body hardly turns while it is pushed: then its axes are but axes
+    that are turned against the world's.
+    """
+    x, y, _ = path.wrench.T
+    force = np.hypot(x, y)
+    mean = np.sum(force[:, None] * _axis(path, 0), axis=0)
+    if np.hypot(*mean) > (1.0 - _LEAST_TURNED) * np.sum(force):
+        return np.zeros_like(path.wrench)
+    turned = _along(_axis(path, 0), x) + _along(_axis(path, 1), y)
+    return turned - path.wrench * [1.0, 1.0, 0.0]
+
+
+def _turn(coefficient: np.ndarray) -> str:
+    """The angle: its tangent is known where forces alone tell the mass, else its sine.
+
+    In the first case the mass has taken up the cosine.
+    """
+    (share,) = coefficient
+    low, high = np.degrees([np.arctan(share), np.arcsin(np.clip(share, -1.0, 1.0))])
+    ends = [f"{angle:.2g}" for angle in ((low,) if abs(share) > 1.0 else (low, high))]
+    return f"an angle of {' to '.join(dict.fromkeys(ends))} degrees, counterclockwise"
+
+
 def _own_axis_law(letter: str, number: int) -> tuple[Law, Law]:
     """Friction along one of the body's axes, and another mass along it."""
     return (
@@ -123,6 +169,31 @@ def _own_axis_law(letter: str, number: int) -> tuple[Law, Law]:
             f"a further share of the applied force along its own {letter}",
             "",
             lambda p: [_along(_axis(p, number), _force_along(p, number))],
+        ),
+    )
+
+
+def _negated_laws() -> tuple[Law, Law]:
+    """An axis of wrenches that points the other way round.
+
+    Where only forces tell the mass, one of them is the other's negative.
+    """
+    return (
+        Law(
+            "x_negated",
+            "what the applied force would add if its x were counted the other way "
+            "round (if negative: its y), a share of",
+            "",
+            lambda p: [_mirrored(p, np.diag([-1.0, 1.0]))],
+            is_of_axes=True,
+        ),
+        Law(
+            "y_negated",
+            "what the applied force would add if its y were counted the other way "
+            "round (if negative: its x), a share of",
+            "",
+            lambda p: [_mirrored(p, np.diag([1.0, -1.0]))],
+            is_of_axes=True,
         ),
     )
 
@@ -179,6 +250,31 @@ LAWS: tuple[Law, ...] = (
     ),
     *_own_axis_law("x", 0),
     *_own_axis_law("y", 1),
+    Law(
+        "turned",
+        "a share of the applied force turned by a quarter turn, as where wrenches and "
+        "poses have axes of their own",
+        "",
+        lambda p: [_quarter_turned(p)],
+        _turn,
+        is_of_axes=True,
+    ),
+    *_negated_laws(),
+    Law(
+        "exchanged",
+        "what the applied force would add if its x were y and its y were x, a share of",
+        "",
+        lambda p: [_mirrored(p, np.array([[0.0, 1.0], [1.0, 0.0]]))],
+        is_of_axes=True,
+    ),
+    Law(
+        "own_frame",
+        "what the applied force would add if its components were along the body's own "
+        "axes, a share of",
+        "",
+        lambda p: [_out_of_own_frame(p)],
+        is_of_axes=True,
+    ),
     Law(
         "spin_coulomb",
         "a torque of constant size along its spin",

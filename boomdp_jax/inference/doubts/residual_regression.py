@@ -48,6 +48,8 @@ class LawFit(NamedTuple):
     sd: Float[np.ndarray, " part"]
     log_bayes_factor: float
     """Of the model with the law against the one without."""
+    steady: float = -np.inf
+    """The same by how alike coefficients of different stretches of rows are, alone."""
 
 
 class Absorbed(NamedTuple):
@@ -112,16 +114,27 @@ def fit_law(
     score = left.T @ known.rest
     covariance = np.linalg.inv(information)
     best = covariance @ score
-    plain = best @ score
+    plain = float(best @ score)
     precision = _jackknife(left[: len(unit)], known.rest[: len(unit)], num_rows)
-    wald = float(min(plain, best @ precision @ best))
-    size = float(num_rows)
-    evidence = 0.5 * wald * size / (1 + size) - 0.5 * num_parts * np.log1p(size)
+    steady = float(best @ precision @ best)
     return LawFit(
         coefficient=-best / length,
         sd=np.sqrt(np.diagonal(covariance)) / length,
-        log_bayes_factor=evidence,
+        log_bayes_factor=unit_information(min(plain, steady), num_parts, num_rows),
+        steady=unit_information(steady, num_parts, num_rows),
     )
+
+
+def unit_information(wald: float, num_parts: int, num_rows: int) -> float:
+    """Log Bayes factor of coefficients with a prior worth one row.
+
+    Args:
+        wald: their square in their own spread, or twice the log-likelihood they gain.
+        num_parts: how many.
+        num_rows: that tell of them.
+    """
+    size = float(num_rows)
+    return 0.5 * wald * size / (1 + size) - 0.5 * num_parts * float(np.log1p(size))
 
 
 def _jackknife(

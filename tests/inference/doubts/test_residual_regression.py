@@ -167,6 +167,9 @@ def test_laws_of_the_bodys_own_frame_turn_with_the_world():
         path.until_end,
     )
     for law in LAWS:
+        # Mirrors, and components along a body's axes, are no turns of the world.
+        if law.name in ("x_negated", "y_negated", "exchanged", "own_frame"):
+            continue
         if law.name in ("constant_force", "heading", "axis_limit"):
             continue
         for first, second in zip(law.wrench(path), law.wrench(turned), strict=True):
