@@ -258,10 +258,11 @@ class _Block:
     ) -> list[BodyLaw]:
         """The same laws, those of axes that hold all along at less noise as well.
 
-        Unless with less noise another law explains more, of which these are a part.
+        Unless another law explains more, of which these are a part.
         """
         axes = [x for x in found if x.law.is_of_axes and is_worth_asking(x.fit)]
-        if not axes:
+        best = max(found, key=lambda one: one.fit.log_bayes_factor, default=None)
+        if best is None or not best.law.is_of_axes or not axes:
             return found
         others = [one for one in found if not one.law.is_of_axes]
         others.sort(key=lambda one: -one.fit.log_bayes_factor)
@@ -277,8 +278,8 @@ class _Block:
         ]
         z = self._z[self._used]
         fits = weighed_again([one.fit for one in asked], levels, z, self._is_normal)
-        best = max(range(len(asked)), key=lambda place: fits[place].log_bayes_factor)
-        if best >= len(axes):
+        first = max(range(len(asked)), key=lambda place: fits[place].log_bayes_factor)
+        if first >= len(axes):
             return found
         again = [one._replace(fit=fit) for one, fit in zip(axes, fits, strict=False)]
         return again + [one for one in found if not any(one is each for each in axes)]
