@@ -12,7 +12,10 @@ from boomdp_jax.core.quick_compile import KeptJit
 from boomdp_jax.inference.hypotheses.whole_motion import whole_scene
 from boomdp_jax.inference.posteriors.posterior import Posterior
 from boomdp_jax.inference.posteriors.predict import commands_in_effect, sample_readings
-from boomdp_jax.inference.posteriors.prediction_starts import PredictionStarts
+from boomdp_jax.inference.posteriors.prediction_starts import (
+    PredictionStarts,
+    with_walls,
+)
 from boomdp_jax.viz.style import BASELINE, PREDICTION, READING
 
 _sample = KeptJit(sample_readings, static=("freedom", "is_true"))
@@ -59,6 +62,7 @@ def draw_prediction(
             before it, too few rows follow the start, or there is no such quantity.
     """
     spec = posterior.spec
+    history = with_walls(spec, history)
     is_static = np.array([entry.is_static for entry in spec.bodies])
     key = jax.random.key(0) if key is None else key
     kept = posterior.thin(num_draws)

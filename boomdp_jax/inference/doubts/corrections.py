@@ -25,11 +25,11 @@ from boomdp_jax.inference.likelihoods.tracking import Gains
 # Rows of a window, and how many a body needs.
 _WINDOW, _FEWEST = 20, 60
 # Noise of the motion by what pushes do, and ratio and score, from which on motion does
-# not follow wrenches. Of 72 objects in MuJoCo with right wrenches (free, hinged, on a
-# slide, on wheels, on a floor) noise came to 0.21 at most, but for one in which it was
-# but a high draw (ratio 0.1). With an axis of forces negated or two exchanged, which a
-# door may take for a mass that nothing moves, it came to 0.7 to 470, ratios mostly to
-# 4 and more.
+# not follow wrenches. Of 84 objects in MuJoCo with right wrenches (free, hinged, on a
+# slide, on wheels, on a floor, hinged on a floor) noise came to 0.55 at most, but for a
+# free box in a high draw and one that hung and rubbed (7.7), neither of which went one
+# way. With an axis of forces negated or two exchanged, which a door may take for a mass
+# that nothing moves, it came to 0.1 to 470, ratios mostly to 4 and more.
 _MOST_BY_CHANCE = 1.0
 _LEAST_RATIO, _LEAST_SCORE = 2.0, 3.0
 

@@ -27,7 +27,10 @@ from boomdp_jax.inference.hypotheses.whole_motion import (
     whole_scene,
 )
 from boomdp_jax.inference.posteriors.posterior import Posterior
-from boomdp_jax.inference.posteriors.prediction_starts import PredictionStarts
+from boomdp_jax.inference.posteriors.prediction_starts import (
+    PredictionStarts,
+    with_walls,
+)
 from boomdp_jax.inference.posteriors.random_motion import add_impulse, add_reading_noise
 from boomdp_jax.inference.posteriors.summary import CHANNELS, plain
 from boomdp_jax.physics import Params, State, rollout, state_from_array, step
@@ -94,6 +97,7 @@ def predict(
     if not np.any(history.mask):
         raise ValueError("history: expected at least one row, got none")
     key = jax.random.key(0) if key is None else key
+    history = with_walls(posterior.spec, history)
     kept = _enough_draws(posterior, num_draws)
     table = jax.tree.map(np.asarray, history)
     is_static = np.asarray(posterior.spec.scene.is_static)

@@ -58,6 +58,33 @@ class Carried(NamedTuple):
     """At how many instants of the run it was read until then."""
 
 
+def with_walls(spec: SceneSpec, history: History) -> History:
+    """Readings with static bodies where the scene puts them, read or not.
+
+    Likelihoods have them there; a wall that might be elsewhere would move what it hits.
+
+    Args:
+        spec: the scene.
+        history: its readings.
+    """
+    stands = _stands(spec)
+    if not stands.any():
+        return history
+    pose = np.concatenate([spec.pose, np.zeros_like(spec.pose)], axis=-1)
+    filled: dict[str, Array] = {}
+    for name in ("state", "next_state"):
+        values, seen = (np.array(getattr(history, f"{name}{end}")) for end in _PARTS)
+        values[:, stands], seen[:, stands] = pose[stands], True
+        filled[name] = on_device(values)
+        filled[f"{name}_mask"] = on_device(seen, bool)
+    return dataclasses.replace(history, **filled)
+
+
+def _stands(spec: SceneSpec) -> Bool[np.ndarray, " body"]:
+    """Static bodies whose pose the scene gives."""
+    return np.asarray(spec.is_static) & np.all(np.isfinite(spec.pose), axis=-1)
+
+
 class PredictionStarts:
     """The rows of a history that may be predicted from, and the states there."""
 
@@ -282,7 +309,8 @@ def filtered_starts(
     spec, world = posterior.spec, whole_scene(posterior.spec)
     reading = posterior.noise_scale
     if world.contact is not None:
-        history, reading = _with_walls(spec, history, reading)
+        is_known = _stands(spec)[:, None]
+        reading = jnp.where(is_known, _WALL_NOISE, reading)
     mask, dt = np.asarray(history.mask), np.asarray(history.dt)
     is_uniform = bool(np.all(dt[mask] == dt[0]))
     actuator = posterior.params.actuator
@@ -306,25 +334,6 @@ def filtered_starts(
     is_static = np.asarray(spec.scene.is_static)
     starts[:, :, is_static] = np.asarray(history.state)[:, is_static]
     return on_device(starts, drawn.dtype)
-
-
-def _with_walls(
-    spec: SceneSpec, history: History, reading: Float[Array, "draw body 4"]
-) -> tuple[History, Float[Array, "draw body 4"]]:
-    """Readings of static bodies where the scene puts them, and next to no noise.
-
-    Likelihoods have them there; a wall that might be elsewhere would move what it hits.
-    """
-    is_static = np.asarray(spec.is_static) & np.all(np.isfinite(spec.pose), axis=-1)
-    pose = np.concatenate([spec.pose, np.zeros_like(spec.pose)], axis=-1)
-    filled: dict[str, Array] = {}
-    for name in ("state", "next_state"):
-        values, seen = (np.array(getattr(history, f"{name}{end}")) for end in _PARTS)
-        values[:, is_static], seen[:, is_static] = pose[is_static], True
-        filled[name] = on_device(values)
-        filled[f"{name}_mask"] = on_device(seen, bool)
-    scale = jnp.where(is_static[:, None], _WALL_NOISE, reading)
-    return dataclasses.replace(history, **filled), scale
 
 
 def _impulses(posterior: Posterior) -> Float[Array, "draw body 2"]:

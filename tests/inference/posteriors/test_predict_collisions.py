@@ -112,21 +112,22 @@ def test_transitions_through_a_collision_are_those_of_the_closed_form():
 
 
 def bounced(rng, e: float) -> np.ndarray:
-    """Poses of a disc and of the wall that it hits half-way, without friction."""
+    """States of a disc and of the wall that it hits half-way, without friction."""
     speed, along = rng.uniform(0.5, 1.5), rng.uniform(-0.5, 0.5)
     turn, spin = rng.uniform(-1.0, 1.0, 2)
     time = DT * np.arange(NUM_ROWS + 1)
     touch = rng.uniform(0.48, 0.52) * NUM_ROWS * DT
-    x = np.where(time < touch, speed * (time - touch), -e * speed * (time - touch))
-    disc = np.stack([x - 0.1, along * time, turn + spin * time], axis=-1)
-    wall = np.broadcast_to([0.1, 0.0, 0.0], disc.shape)
+    rate = np.where(time < touch, speed, -e * speed)
+    still = np.zeros_like(time)
+    place = [rate * (time - touch) - 0.1, along * time, turn + spin * time]
+    disc = np.stack([*place, rate, still + along, still + spin], axis=-1)
+    wall = np.broadcast_to([0.1, 0.0, 0.0, 0.0, 0.0, 0.0], disc.shape)
     return np.stack([disc, wall], axis=1)
 
 
-@pytest.mark.slow
-def test_walls_stand_where_the_scene_has_them_whether_read_or_not():
+def ball_and_wall():
     contact = {"friction": 0.0, "restitution": 0.5}
-    spec = scene_spec_from_dict(
+    return scene_spec_from_dict(
         {
             "schema": "planar-scene-1",
             "dt": DT,
@@ -148,8 +149,13 @@ def test_walls_stand_where_the_scene_has_them_whether_read_or_not():
         },
         source="test",
     )
+
+
+@pytest.mark.slow
+def test_walls_stand_where_the_scene_has_them_whether_read_or_not():
+    spec = ball_and_wall()
     rng = np.random.default_rng(5)
-    poses = np.stack([bounced(rng, 0.5) for _ in range(100)])
+    poses = np.stack([bounced(rng, 0.5)[..., :3] for _ in range(100)])
     poses[:, :, 1] = np.nan
     with jax.enable_x64(False):
         history = seen(rng, poses)
@@ -160,3 +166,21 @@ def test_walls_stand_where_the_scene_has_them_whether_read_or_not():
         assert scores["coverage90"] == pytest.approx(0.9, abs=0.06)
         # Of a wall whose place is not known nobody could say where a ball comes back.
         assert scores["rmse"] < 12.0 * SD
+
+
+@pytest.mark.slow
+def test_unread_walls_stand_there_where_predictions_start_from_whole_readings():
+    spec, rng = ball_and_wall(), np.random.default_rng(6)
+    states = np.stack([bounced(rng, 0.5) for _ in range(4)])
+    states[:, :, 1] = np.nan
+    rows = (states[:, :-1], states[:, 1:])
+    state, after = (each.reshape(-1, *each.shape[2:]) for each in rows)
+    history = make_history(state, np.zeros((len(state), 2, 3)), after, DT)
+    exact = certain(spec, sd=1e-7)
+    exact = dataclasses.replace(exact, noise_scale=jnp.full((NUM_DRAWS, 2, 4), 1e-7))
+    found = predict(exact, history, (1,), num_draws=NUM_DRAWS)
+    assert found["starts"] == "readings"
+    assert found["num_starts"]["1"] == len(state)
+    scores = found["horizons"]["1"]
+    assert scores["position"]["rmse"] < 1e-4
+    assert scores["velocity"]["rmse"] < 1e-3
